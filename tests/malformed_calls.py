@@ -166,7 +166,7 @@ OPTIONS |= {
 }
 OPTIONS |= {
     "calls['fit'](ts=TS)": ("TypeError", "each `Experiment` states start, times and inputs"),
-    "calls['fit'](retry=True)": ("TypeError", "its motions are compiled"),
+    "calls['fit'](retry=True)": ("TypeError", "by one compiled method"),
     "calls['log_likelihood'](events=False)": ("TypeError", "ends with its last sample"),
     "calls['Study.run'](parameters=None)": ("TypeError", "`outputs` and `save` choose the stored results"),
     "calls['simulate'](backend='native', solver=diffrax.Heun())": (

@@ -76,8 +76,10 @@ def prefixes(names: list[str]) -> list[str]:
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     if len(names) < 2:
         return [""] * len(names)
-    numbers = [plain[: k + 1].count(name) for k, name in enumerate(plain)]
-    return [f"{name}-{k}-" if k > 1 else f"{name}-" for name, k in zip(plain, numbers, strict=True)]
+    return [
+        f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-"
+        for k, name in enumerate(plain)
+    ]
 
 
 def _figures(study: Study, out: Path, prefix: str) -> list[Path]:

@@ -165,18 +165,12 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
         raise ValueError("the file has no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))
     vary = {name: _varying(name, how) for name, how in asked.get("vary", {}).items()}
-    if "start" in asked:
-        start = {
-            name: _varying(name, how) if isinstance(how, Mapping) else how
-            for name, how in asked["start"].items()
-        }
-    else:
-        start = None
+    start = asked.get("start") and {
+        name: _varying(name, how) if isinstance(how, Mapping) else how for name, how in asked["start"].items()
+    }
     correlation = {tuple(pair.split()): value for pair, value in asked.get("correlation", {}).items()}
     known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
-    outputs = (
-        {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
-    )
+    outputs = asked.get("outputs") and {name: _output(name, how) for name, how in asked["outputs"].items()}
     how = {name: asked[name] for name in ("t1", "save", "keep_every", "chunk") if name in asked} | asked.get(
         "options", {}
     )

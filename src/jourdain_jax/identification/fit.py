@@ -89,7 +89,7 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
         place[some] += 1
         followed = problem.is_followed(grown.at, spans, 100.0)  # in squares expected from noise
         for k in range(1, len(spans)):
-            # the next span is followed already, and skipped
+            # skip the next span if the motion follows it already
             place[some] += (place[some] == k) & followed[:, k]
     grown = of(poor, way.theta, control).after(way, np.arange(len(poor)))
     found = found.lowered(poor, replace(grown, grown=np.ones(len(poor), bool)))

@@ -34,15 +34,8 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
         pool = client.get_executor(pure=False)
 
         def compute(numbers: list[int], alone: bool):
-            killed = distributed.KilledWorker
-            return computed(
-                lambda number: pool.submit(_chunk, number, *asked),
-                killed,
-                store,
-                numbers,
-                interrupted,
-                1 if alone else most,
-            )
+            killed, submit = distributed.KilledWorker, lambda number: pool.submit(_chunk, number, *asked)
+            return computed(submit, killed, store, numbers, interrupted, 1 if alone else most)
 
         return whatever_dies(store, numbers, interrupted, compute, 1)
 

@@ -133,11 +133,8 @@ class Design(Printed):
                     "fewer, or distributions"
                 )
         else:
-            object.__setattr__(
-                self,
-                "variables",
-                {name: np.asarray(column, float) for name, column in self.variables.items()},
-            )
+            columns = {name: np.asarray(column, float) for name, column in self.variables.items()}
+            object.__setattr__(self, "variables", columns)
             lengths = {name: len(column) for name, column in self.variables.items()}
             if len(set(lengths.values())) > 1:
                 raise ValueError(
@@ -161,11 +158,8 @@ class Design(Printed):
                     f"`correlation` has the entry {pair!r}, expected pairs of names, such as "
                     f"({names[0]!r}, {names[-1]!r}): 0.5"
                 )
-            value = float(
-                checked_known(
-                    value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"
-                )
-            )
+            advice = "give a number between -1 and 1"
+            value = float(checked_known(value, f"the correlation of {pair}", (), advice=advice))
             check_names(pair, names, "`correlation` names `{}`, which does not vary")
             if len(set(pair)) != 2 or not -1 < value < 1:
                 raise ValueError(

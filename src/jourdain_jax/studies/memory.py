@@ -1,5 +1,4 @@
-"""Bounds on a study: the disk of its folder, and the memory of its processes (resident memory, sizes of blocks
-and chunks).
+"""Bounds on a study: the disk of its folder, and the memory of its processes, by sizes of blocks and chunks.
 
 The memory that a process needs is estimated before it compiles anything, and checked after every block:
 

@@ -39,11 +39,8 @@ class Output:
 
 def _check_name(output: Output, name, scene: Scene) -> None:
     valid = (*scene.coordinate_names, *scene.speed_names)
-    check_name(
-        name,
-        valid,
-        f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed",
-    )
+    what = f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed"
+    check_name(name, valid, what)
 
 
 @dataclass(frozen=True)

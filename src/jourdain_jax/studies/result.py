@@ -247,14 +247,8 @@ class StudyResult(Printed):
             axis, (counts, edges, beyond) = whole.add_subplot(1, len(names), k + 1), self._bars(name, cells)
             axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
             if beyond.any():
-                axis.stairs(
-                    np.where(beyond, counts, 0),
-                    edges,
-                    fill=True,
-                    color="#1f5fa8",
-                    alpha=0.25,
-                    label="anywhere in here",
-                )
+                pale = {"color": "#1f5fa8", "alpha": 0.25, "label": "anywhere in here"}
+                axis.stairs(np.where(beyond, counts, 0), edges, fill=True, **pale)
                 axis.legend(fontsize="small")
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
             column = self.store.columns.get(name)
@@ -289,11 +283,8 @@ class StudyResult(Printed):
             for name, count in self.counts.items()
         ]
         if self.failed.size:
-            lines.append(
-                "  failed: samples "
-                + ", ".join(map(str, self.failed[:10]))
-                + (" ..." if self.failed.size > 10 else "")
-            )
+            some = ", ".join(map(str, self.failed[:10]))
+            lines.append(f"  failed: samples {some}{' ...' if self.failed.size > 10 else ''}")
         if tally.again[0]:
             lines.append(f"  {tally.again[0]} were run again in another way")
         if done:

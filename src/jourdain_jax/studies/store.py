@@ -286,14 +286,9 @@ class Store:
         """
         try:
             found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
-            own = [self.identity, self._digests.get(GRID, found.of[-1])]
-            if ((found.first, found.last), list(found.of), {*found.checksums}) == (
-                self.span(number),
-                own,
-                {*self.columns},
-            ):
-                return found
-            return None
+            own = self.span(number), [self.identity, self._digests.get(GRID, found.of[-1])], {*self.columns}
+            stored = (found.first, found.last), list(found.of), {*found.checksums}
+            return found if stored == own else None
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             return None
 

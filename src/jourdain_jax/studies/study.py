@@ -126,11 +126,8 @@ class Study(Printed):
         groups = {group for names in (q, u) for group, _, _ in names.groups}
         constants = {}
         for name, how in (self.scene.example if self.start is None else self.start).items():
-            check_name(
-                name,
-                (*q, *u, *groups),
-                f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with",
-            )
+            what = f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with"
+            check_name(name, (*q, *u, *groups), what)
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
                 checked_real(how, f"start `{name}`", advice="give its value")
                 constants[name] = how
@@ -160,19 +157,14 @@ class Study(Printed):
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
-            keep_every = checked_whole(
-                keep_every,
-                "`keep_every`",
-                1,
-                MOST_SAMPLES,
-                expected="of at least 1, or None to store no trajectories",
-            )
+            expected = "of at least 1, or None to store no trajectories"
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, MOST_SAMPLES, expected=expected)
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if (
             isinstance(self._given, Model)
             and self._given.formulation == build(self.scene, backend=options.backend).formulation
         ):
-            # as for the scene itself: a study may continue with another memory bound
+            # the scene's own formulation: a study may continue with another memory bound
             options = replace(options, formulation=None)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
@@ -235,10 +227,11 @@ class Study(Printed):
         chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies with
         other block sizes differ in their last digits.
 
-        Raises ValueError if the folder holds another study, or if its disk or the memory is too small. A sample
-        takes 8 bytes per stored number; there are at most 2^44 samples by default. Raises MemoryError if the
-        memory was exceeded, `InUseError` if another process runs the study, and OSError if the folder cannot
-        be written. Ctrl-C finishes the current chunk, stores all results, and raises KeyboardInterrupt.
+        Raises ValueError if the folder holds another study, or if its disk or the memory is too small. A
+        sample takes 8 bytes per stored number; there are at most 2^44 samples by default. Raises MemoryError
+        if the memory was exceeded, `InUseError` if another process runs the study, and OSError if the folder
+        cannot be written. Ctrl-C finishes the current chunk, stores all results, and raises
+        KeyboardInterrupt.
         """
         task = self.task(**what)
         if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:
@@ -254,13 +247,10 @@ class Study(Printed):
         task, chunk = bounded(
             task, path, chunk, None if memory is None else of_each(memory, processes), here=here
         )
-        compute = (
-            partial(in_this_process, task)
-            if here
-            else on_cluster(task, client)
-            if client is not None
-            else in_processes(task, processes)
-        )
+        if here:
+            compute = partial(in_this_process, task)
+        else:
+            compute = in_processes(task, processes) if client is None else on_cluster(task, client)
         store = run(task, path, chunk=chunk, progress=progress, shard=shard, command=command, workers=compute)
         return StudyResult(store, task)
 

@@ -143,18 +143,12 @@ class Task:
 
     def identity(self) -> dict[str, str]:
         """Return digests of everything that determines the numbers, under the names of the arguments."""
+        drawn = self.design
+        design = dict(drawn.variables), drawn.sampler, len(drawn), drawn.seed, drawn.correlation
         return {
             "scene": digest((type(self.scene), self.scene)),
             "start": digest(dict(self.constants)),
-            "design": digest(
-                (
-                    dict(self.design.variables),
-                    self.design.sampler,
-                    len(self.design),
-                    self.design.seed,
-                    self.design.correlation,
-                )
-            ),
+            "design": digest(design),
             "outputs": digest(dict(self.outputs)),
             "options": digest(dict(sorted(self.settled.items()))),
             "save": digest((self.save, self.keep_every)),

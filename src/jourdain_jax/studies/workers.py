@@ -46,14 +46,8 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
             with ProcessPoolExecutor(
                 most, mp_context=context, initializer=_begin, initargs=(sent, places, begun)
             ) as pool:
-                died = yield from computed(
-                    lambda number: pool.submit(chunk, number, sent, str(store.path)),
-                    BrokenProcessPool,
-                    store,
-                    numbers,
-                    interrupted,
-                    most,
-                )
+                submit = lambda number: pool.submit(chunk, number, sent, str(store.path))
+                died = yield from computed(submit, BrokenProcessPool, store, numbers, interrupted, most)
                 if died and not begun.is_set():
                     raise RuntimeError(_NONE_BEGAN)
                 return died

@@ -26,14 +26,8 @@ def draw_eigenvalues(study: Study, path: FilePath) -> None:
     nominal, samples = study.eigenvalues[0], study.eigenvalues[1:][study.physical]
     for name, columns, colour in _MODES:
         for column in columns:
-            _band(
-                real,
-                study.grid,
-                nominal[:, column].real,
-                samples[:, :, column].real,
-                colour,
-                name if column == columns[0] else None,
-            )
+            label = name if column == columns[0] else None
+            _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, label)
     _band(
         imaginary, study.grid, np.abs(nominal[:, 2].imag), np.abs(samples[:, :, 2].imag), "tab:blue", "weave"
     )
@@ -123,10 +117,5 @@ def animate_ride(study: Study, path: FilePath) -> None:
     """Animate the first ride (below the stable range), with the view following the bicycle."""
     rides = study.rides
     lane = rides.lanes.lane(0)
-    animate(
-        lane,
-        path,
-        follow=True,
-        paths=[],
-        title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}",
-    )
+    title = f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}"
+    animate(lane, path, follow=True, paths=[], title=title)

@@ -52,12 +52,8 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
     if isinstance(ground, Curved):
         return _surface(trajectory, drawn, name, contact, low, high)
     plane = contact.plane
-    return _plane(
-        np.asarray(plane.origin)[0],
-        np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1),
-        low,
-        high,
-    )
+    axes = np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1)
+    return _plane(np.asarray(plane.origin)[0], axes, low, high)
 
 
 def _moves(contact: Contact) -> bool:

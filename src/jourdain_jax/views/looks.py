@@ -63,12 +63,8 @@ class Drawn:
     @property
     def size(self) -> float:
         """Return the longest side (m) of the bounding box of all bodies at the first time."""
-        return float(
-            max(
-                np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(),
-                1e-3,
-            )
-        )
+        corners = np.concatenate([body.extents()[0] for body in self.bodies.values()])
+        return float(max(np.ptp(corners, axis=0).max(), 1e-3))
 
     @property
     def thin(self) -> float:

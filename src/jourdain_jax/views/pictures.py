@@ -55,9 +55,9 @@ def animate(
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     drawn = looks_of(trajectory, "animate", frames)
-    traces = _traces(
-        trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths
-    )
+    if paths is None:
+        paths = [(name, np.zeros(3)) for name in drawn.bodies if name]
+    traces = _traces(trajectory, drawn, paths)
     bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
     boxes = np.stack([box_of(faces[:1]) for faces in bodies])
     whole = box_of([*boxes, *traces])
@@ -108,19 +108,14 @@ def draw_still(
             "or elevation and azimuth in degrees"
         )
     plt, drawn = pyplot(), looks_of(trajectory)
-    wanted = (
-        np.asarray(at, float)
-        if not isinstance(at, int)
-        else np.linspace(drawn.ts[0], drawn.ts[-1], at)
-        if at > 1
-        else drawn.ts[-1:]
-    )
+    if not isinstance(at, int):
+        wanted = np.asarray(at, float)
+    else:
+        wanted = np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
     chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
-    traces = _traces(
-        trajectory,
-        drawn,
-        [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths,
-    )
+    if paths is None:
+        paths = [(next(name for name in drawn.bodies if name), np.zeros(3))]
+    traces = _traces(trajectory, drawn, paths)
     strengths = np.linspace(1.0, 0.35, len(chosen))[::-1]
     faces, colours = zip(*map(painted, [drawn] * len(chosen), chosen, strengths), strict=True)
     figure = plt.figure(figsize=(6.4, 4.2), dpi=100)

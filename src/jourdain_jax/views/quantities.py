@@ -157,13 +157,8 @@ def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
     for axis, name in zip(axes, names[1:], strict=True):
         y = family[name] / sizes[name][1]
         axis.plot(x, y, "C0--", lw=1.0, label=None if family.stable.all() else "unstable")
-        axis.plot(
-            x,
-            np.where(family.stable, y, np.nan),
-            "C0-",
-            lw=2.0,
-            label="stable" if family.stable.any() else None,
-        )
+        stable = np.where(family.stable, y, np.nan)
+        axis.plot(x, stable, "C0-", lw=2.0, label="stable" if family.stable.any() else None)
         for kind, (mark, points) in marks.items():
             xy = [[point[k] / sizes[k][1] for point in points] for k in (names[0], name)]
             axis.plot(
@@ -278,11 +273,7 @@ def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> 
         )
     if name in ENERGIES:
         energies = motion.energies()
-        return np.asarray(
-            {
-                "energy": energies.kinetic + energies.potential,
-                "kinetic energy": energies.kinetic,
-                "potential energy": energies.potential,
-            }[name]
-        )
+        if name == "energy":
+            return np.asarray(energies.kinetic + energies.potential)
+        return np.asarray(energies.kinetic if name == "kinetic energy" else energies.potential)
     return np.asarray(motion[name])

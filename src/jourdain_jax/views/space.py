@@ -90,12 +90,8 @@ def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarr
     fallen[..., :2] = np.clip(fallen[..., :2], *box[:, :2])
     axes.add_collection3d(Poly3DCollection(fallen, facecolors="#d3d3ce", zorder=1))
     seen = (normals_of(corners) @ towards(axes.elev, axes.azim) > 0) | (colours[:, 3] < 1)
-    lines = np.concatenate(
-        [
-            np.zeros((0, 4, 3)),
-            *(path[:-1, None] + np.diff(path, axis=0)[:, None] * [[0], [1], [1], [0]] for path in paths),
-        ]
-    )
+    along = [path[:-1, None] + np.diff(path, axis=0)[:, None] * [[0], [1], [1], [0]] for path in paths]
+    lines = np.concatenate([np.zeros((0, 4, 3)), *along])
     corners = np.concatenate([corners[seen], lines])
     colours = np.concatenate([colours[seen], np.tile([*rgb(_INK), 1.0], (len(lines), 1))])
     axes.add_collection3d(

@@ -169,24 +169,16 @@ class Accelerometer(Instrument):
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
         check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
-        self.point = checked_real(
-            point, "`point` of `Accelerometer`", (3,), advice="give three components in the body's frame, m"
-        )
-        self.gravity = checked_real(
-            gravity,
-            "`gravity` of `Accelerometer`",
-            (3,),
-            advice="give three components in the inertial frame, m/s^2",
-        )
+        advice = "give three components in the body's frame, m"
+        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice=advice)
+        advice = "give three components in the inertial frame, m/s^2"
+        self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice=advice)
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
         """Raise ValueError, naming the `channel` and the run (`where`), if the scene has no such body."""
         bodies = motion_shape(scene).bodies
-        check_name(
-            self.body,
-            bodies,
-            f"the accelerometer `{channel}` of {where} is on body `{self.body}`, which does not exist",
-        )
+        what = f"the accelerometer `{channel}` of {where} is on body `{self.body}`, which does not exist"
+        check_name(self.body, bodies, what)
 
     def over_times(self, motion: Trajectory) -> OverTimes:
         """Return the readings at all times of one motion."""
@@ -231,15 +223,11 @@ class LoadCell(Instrument):
         its force is not determined.
         """
         determined = _determined(scene)
-        check_name(
-            self.contact,
-            determined,
-            f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which does not exist",
-        )
+        what = f"the load cell `{channel}` of {where} is under contact `{self.contact}`"
+        check_name(self.contact, determined, f"{what}, which does not exist")
         if not determined[self.contact]:
             raise ValueError(
-                f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not "
-                "determined, because other contacts share it; omit the channel"
+                f"{what}, whose force is not determined, because other contacts share it; omit the channel"
             )
 
     def over_times(self, motion: Trajectory) -> OverTimes:

@@ -48,11 +48,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
     """
     intervals, beyond = np.diff(ts), 1.5  # allowed distance of the ends from the run's, in intervals
     spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
-    spans += (
-        [f"its last value from {ts[-1]:.6g} to {end:.6g} s"]
-        if end - ts[-1] > beyond * max(intervals[-2:])
-        else []
-    )
+    if end - ts[-1] > beyond * max(intervals[-2:]):
+        spans.append(f"its last value from {ts[-1]:.6g} to {end:.6g} s")
     if spans:
         yield (
             f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "

@@ -56,7 +56,7 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
     return xp.where(xp.arange(count + 1) == until, end, found)  # without round-off at this time
 
 
-POINTS = 6  # of the grid, that a polynomial goes through
+POINTS = 6  # grid points that determine a polynomial
 _MIDDLE = (POINTS - 1) / 2
 # values -> coefficients, highest power first
 _COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE))
@@ -128,15 +128,9 @@ def _relaxed(
         particular = particular + (-quick) ** order * derivative
     decay = jnp.exp(-since / jnp.maximum(quick, _LEAST))
     by_formula = jnp.polyval(particular, begin + since) + (y - jnp.polyval(particular, begin)) * decay
-    weights = (
-        since
-        / slow
-        * jnp.asarray(_WEIGHTS, polynomial.dtype)
-        * jnp.exp(-since * (1 - _NODES.astype(polynomial.dtype)) / slow)
-    )
-    inside = jax.vmap(lambda node: jnp.polyval(polynomial, begin + since * node))(
-        jnp.asarray(_NODES, polynomial.dtype)
-    )
+    nodes, parts = (jnp.asarray(x, polynomial.dtype) for x in (_NODES, _WEIGHTS))
+    weights = since / slow * parts * jnp.exp(-since * (1 - nodes) / slow)
+    inside = jax.vmap(lambda node: jnp.polyval(polynomial, begin + since * node))(nodes)
     by_quadrature = y * jnp.exp(-since / slow) + weights @ inside
     return jnp.where(small, by_formula, by_quadrature)
 

@@ -66,7 +66,7 @@ class Range:
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
         if self.kind == "positive":
-            return guess * 5.0 ** (2 * share - 1)  # five: by which a first guess may be wrong
+            return guess * 5.0 ** (2 * share - 1)  # a first guess may be wrong by a factor of five
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
@@ -187,12 +187,8 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
         for name, x in mean.items()
     ]
     n, names = len(means), list(mean)
-    C = checked_known(
-        covariance,
-        "`covariance` of `joint_normal`",
-        (n, n),
-        advice=f"one row and one column for each of {', '.join(names)}",
-    )
+    advice = f"give one row and one column for each of {', '.join(names)}"
+    C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice=advice)
     if not (all_finite(C) and all_finite(means)):
         raise ValueError("mean and covariance of `joint_normal` must be finite; omit unknown quantities")
     for name, variance in zip(names, variances := np.diag(C), strict=True):
@@ -260,21 +256,11 @@ class Estimate:
             guess = checked_known(self.guess, "`guess` of `Estimate`", advice="give a number")
             if not all_finite(guess):
                 raise ValueError(f"`guess` of `Estimate` is {self.guess}, expected a finite number")
-            object.__setattr__(
-                self,
-                "guess",
-                (
-                    tuple(guess.tolist())
-                    if guess.ndim == 1
-                    else float(checked_known(guess, "`guess` of `Estimate`", ()))
-                ),
-            )
-        check_kind(
-            self.range,
-            Range | None,
-            "`range` of `Estimate`",
-            "`bounds(low, high)`, `positive()` or `unbounded()`",
-        )
+            one = guess.ndim != 1
+            found = float(checked_known(guess, "`guess` of `Estimate`", ())) if one else tuple(guess.tolist())
+            object.__setattr__(self, "guess", found)
+        ranges = "`bounds(low, high)`, `positive()` or `unbounded()`"
+        check_kind(self.range, Range | None, "`range` of `Estimate`", ranges)
         check_kind(self.per_run, bool, "`per_run` of `Estimate`", "True or False")
         if self.prior is not None:
             _check_prior(self.prior)

@@ -110,13 +110,8 @@ def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
     numbers = {name: array_module(x).asarray(x, real_type()) for name, x in numbers.items()}
-    return (
-        numbers,
-        unknown,
-        tuple(
-            n for n, x in numbers.items() if n in unknown or holds(lambda x, n=n: np.any(x != NUMBERS[n]), x)
-        ),
-    )
+    acts = lambda name, x: name in unknown or holds(lambda x: np.any(x != NUMBERS[name]), x)
+    return numbers, unknown, tuple(name for name, x in numbers.items() if acts(name, x))
 
 
 def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:

@@ -131,12 +131,8 @@ class Actuator(eqx.Module):
         hold: bool = False,
     ):
         check_kind(command, Sampled, "`command` of `Actuator`", "`jj.Sampled(ts, values)`")
-        check_kind(
-            hold,
-            bool,
-            "`hold` of `Actuator`",
-            "True (each value until the next) or False (linear between samples)",
-        )
+        kinds = "True (each value until the next) or False (linear between samples)"
+        check_kind(hold, bool, "`hold` of `Actuator`", kinds)
         self.command, self.hold = command, hold
         self.gain, self.bias, self.delay, self.lag = _checked(
             "Actuator", gain=gain, bias=bias, delay=delay, lag=lag

@@ -72,13 +72,8 @@ class Information:
     def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
         """Return the covariance of all unknowns, in their units, along the determined directions."""
         runs, m, p = self.follow.shape[-3:]
-        G = np.concatenate(
-            [
-                np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)),
-                -self.follow.reshape(*self.follow.shape[:-3], runs * m, p),
-            ],
-            axis=-2,
-        )
+        own = -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)
+        G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), own], axis=-2)
         whole = G @ self.shared @ np.swapaxes(G, -1, -2)
         for i in range(runs):
             block = slice(p + i * m, p + (i + 1) * m)
@@ -87,14 +82,8 @@ class Information:
 
     def only(self) -> "Information":
         """Return the values of the only member, without the axis of members."""
-        return replace(
-            self,
-            **{
-                name: np.asarray(x[0])
-                for name, x in vars(self).items()
-                if name not in ("hidden", "estimated")
-            },
-        )
+        of_one = {k: np.asarray(x[0]) for k, x in vars(self).items() if k not in ("hidden", "estimated")}
+        return replace(self, **of_one)
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Return the information with the covariance of the shared unknowns from the differences between

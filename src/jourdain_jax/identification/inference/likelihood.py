@@ -48,11 +48,8 @@ def log_likelihood(
             "number in s, or 0 for white noise"
         )
     check_known(runs, "a likelihood")
-    return jnp.sum(
-        jnp.stack(
-            [jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]
-        )
-    )
+    of = partial(of_run, scene, options=settled)
+    return jnp.sum(jnp.stack([jnp.sum(mapped(of, run)) for _, run in equal_runs(runs)]))
 
 
 def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:

@@ -72,14 +72,10 @@ def noise_levels(
         widths[:, 1:] = np.maximum(
             np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], fewest)), problem.least_sigma
         )
-        widths[:, 0] = (
-            [
-                np.sqrt(of_loss(r, p)) if r.size else 1.0
-                for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)
-            ]
-            if unsure
-            else 1.0
-        )
+        widths[:, 0] = 1.0
+        if unsure:
+            pairs = zip(residuals, determined[:, 0].tolist(), strict=True)
+            widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in pairs]
         widths[untold] = np.inf
         if np.allclose(widths, before, rtol=1e-8, atol=0):
             break

@@ -153,17 +153,10 @@ def planned_information(
             )
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(
-                f"the noise of channel `{name}` has a correlation time, which a plan does not "
-                "support; omit it"
+                f"the noise of channel `{name}` has a correlation time, but a plan needs white noise; omit it"
             )
-    numbers = [
-        eqx.tree_at(
-            lambda r: r.start,
-            run,
-            {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()},
-        )
-        for run in runs
-    ]
+    known = lambda start: {name: np.zeros(x.shape) if is_traced(x) else x for name, x in start.items()}
+    numbers = [eqx.tree_at(lambda r: r.start, run, known(run.start)) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places = unknowns.estimated
     ready = tuple(run_of(run, array_module((run.values, run.sigma))) for run in runs)

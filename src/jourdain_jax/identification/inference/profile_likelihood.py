@@ -29,7 +29,7 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
         0.01,
         float(found.theta[b, place]),
         found.theta[b : b + 1],
-    )  # close: of the rise at the end
+    )  # close: relative to `end`
     bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])
     room = min(abs(bound - origin), 1e6 * first)
     inner, outer, note = (0.0, 0.0), (np.inf, np.inf), ""  # distance and rise on either side

@@ -76,12 +76,7 @@ class ChannelResiduals(Printed, eqx.Module):
         return f"residuals of `{self.channel}` of run {self.run}, in sigmas: {of}"
 
 
-GONE = {
-    "bootstrap": (
-        "`Fit.profiles` gives intervals of nonlinear scenes; for repeats, draw data about "
-        "`simulate` of `scene` and `starts`, and pass them to `fit_batch`"
-    )
-}
+GONE = {"bootstrap": "`Fit.profiles` gives intervals of nonlinear scenes, `fit_batch` those of repeats"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,7 +90,7 @@ class Estimates(Printed):
     """
 
     values: PerUnknown
-    # for an estimate at a bound: distance in standard errors to the data's optimum beyond it; NaN elsewhere
+    # distance of the free optimum beyond the bound, in standard errors; NaN for estimates off a bound
     beyond: PerUnknown
     converged: Marks
     stuck: Marks  # no step lowers the sum of squares, but this is no minimum
@@ -138,13 +133,10 @@ class Estimates(Printed):
     def __getitem__(self, name: str) -> Estimated:
         check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
         i = self.labels.index(name)
-        return Estimated(
-            self.values[..., i],
-            self.standard_errors[..., i],
-            self.low[..., i],
-            self.high[..., i],
-            self.units[i],
+        value, error, low, high = (
+            x[..., i] for x in (self.values, self.standard_errors, self.low, self.high)
         )
+        return Estimated(value, error, low, high, self.units[i])
 
     @property
     def estimates(self) -> dict[str, Estimated]:

@@ -69,11 +69,8 @@ def interval_widths(fit: Estimates) -> str:
         axes.invert_yaxis()
 
     notes = ["red: the interval is wider than the estimate"] if np.any(share >= 100) else []
-    notes += (
-        [f"{len(fit.labels) - len(names)} more unknowns are not drawn"]
-        if len(fit.labels) > len(names)
-        else []
-    )
+    if len(fit.labels) > len(names):
+        notes.append(f"{len(fit.labels) - len(names)} more unknowns are not drawn")
     return figure(draw, 700, 20 * len(names) + 60, "; ".join(notes))
 
 
@@ -171,21 +168,13 @@ def _informed(shares: Informed) -> Section:
         "unknowns."
     )
     shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # runs
-    columns = (
-        {f"run {run}": shares.of_runs[:, run] for run in shown}
-        | shares.of_channels
-        | {"priors": shares.of_priors}
-    )
+    columns = {f"run {run}": shares.of_runs[:, run] for run in shown}
+    columns |= shares.of_channels | {"priors": shares.of_priors}
     rows = [("unknown", *columns, "half of the best run's share")]
     for i, name in enumerate(shares.labels):
         run, begin, end = shares.half(i)
-        rows.append(
-            (
-                name,
-                *(f"{100 * share[i]:.1f} %" for share in columns.values()),
-                f"run {run}, {begin:.3g} to {end:.3g} s",
-            )
-        )
+        parts = (f"{100 * share[i]:.1f} %" for share in columns.values())
+        rows.append((name, *parts, f"run {run}, {begin:.3g} to {end:.3g} s"))
     more = shares.of_runs.shape[1] - len(shown)
     note = [f"The {len(shown)} most informative runs are shown; {more} more are not."] if more else []
     return Section("What informs which unknown", about, table(rows) + note)
@@ -194,13 +183,9 @@ def _informed(shares: Informed) -> Section:
 def _correlations(fit: Estimates) -> Section:
     names = fit.labels[:30]  # unknowns in the table of correlations
     found = fit.correlation[: len(names), : len(names)]
-    rows = [
-        ("", *names),
-        *(
-            (name, *("-" if np.isnan(c) else f"{c:.2f}" for c in row))
-            for name, row in zip(names, found, strict=True)
-        ),
-    ]
+    rows = [("", *names)]
+    for name, row in zip(names, found, strict=True):
+        rows.append((name, *("-" if np.isnan(c) else f"{c:.2f}" for c in row)))
     about = f"The first {len(names)} of {len(fit.labels)} unknowns." if len(fit.labels) > len(names) else ""
     return Section("Correlations", about, table(rows))
 

@@ -105,22 +105,13 @@ class Fit(Estimates):
             )
         if not runs and profiles and not isinstance(profiles, Mapping):
             raise ValueError("profiles are computed from the fitted runs; give these as `data`")
-        along = (
-            profiles
-            if isinstance(profiles, Mapping)
-            else self.profiles(runs, () if profiles is True else profiles)
-            if profiles
-            else {}
-        )
+        if isinstance(profiles, Mapping):
+            along = profiles
+        else:
+            along = self.profiles(runs, () if profiles is True else profiles) if profiles else {}
         shares = informed(*taken_up(self, runs), 24) if runs else None  # at most this many unknowns
-        page = fit_page(
-            self,
-            of_fitted(self, runs) if runs else (),
-            shares,
-            self.predict(others) if others else (),
-            along,
-            units or {},
-        )
+        fitted, held_out = of_fitted(self, runs) if runs else (), self.predict(others) if others else ()
+        page = fit_page(self, fitted, shares, held_out, along, units or {})
         with open(path, "w", encoding="utf-8") as file:
             file.write(page)
 

@@ -17,13 +17,8 @@ def warnings_of(fit: Estimates) -> Sentences:
         # sigmas: the square overflows
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
-        return (
-            (
-                "the motion fails at the first guess, so that there is nothing to fit; examine it with "
-                "`simulate`"
-            ),
-            *fit.events_met,
-        )
+        failed = "the motion fails at the first guess; examine it with `simulate`"
+        return failed, *fit.events_met
     return (
         *_of_the_minimum(fit),
         *fit.impossible,
@@ -164,27 +159,15 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
     ]
     found = []
     for channels in (names, *([name] for name in names)):
-        squares = (
-            np.concatenate(
-                [
-                    np.zeros(0),
-                    *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run),
-                ]
-            )
-            ** 2
-        )
+        parts = [np.ravel(run[name]) for run in fit.whitened for name in channels if name in run]
+        squares = np.concatenate([np.zeros(0), *parts]) ** 2
         squares = squares[np.isfinite(squares)]
         if squares.size:
             some = len(channels) < len(names)
             named = f" of {', '.join(f'`{name}`' for name in channels)}" if some else ""
-            found.append(
-                _Size(
-                    channels,
-                    named,
-                    *_mean_square(squares, 0.0 if some else determined, robust),
-                    *_mean_square(squares, determined, robust),
-                )
-            )
+            own = 0.0 if some else determined
+            least, most = (_mean_square(squares, p, robust) for p in (own, determined))
+            found.append(_Size(channels, named, *least, *most))
     return found
 
 

@@ -304,16 +304,6 @@ def profiles(
         closed = low.is_closed, high.is_closed
         kind = ("flat", "one-sided", "bounded")[sum(closed)]
         notes = tuple(dict.fromkeys(one.note for one in (low, high) if one.note))
-        found[name] = Profile(
-            name,
-            unknowns.units[k],
-            estimate,
-            values,
-            2 * rise / inflation[name],
-            low.end,
-            high.end,
-            closed,
-            kind,
-            notes,
-        )
+        unit, rise = unknowns.units[k], 2 * rise / inflation[name]
+        found[name] = Profile(name, unit, estimate, values, rise, low.end, high.end, closed, kind, notes)
     return found

@@ -73,14 +73,8 @@ class Layout:
     @property
     def following(self) -> Labels:
         """Return names of the dependent parameters: moments of inertia of bodies, and tied ones."""
-        return tuple(
-            dict.fromkeys(
-                [
-                    *(entry.name for body in self.bodies for entry in body.entries),
-                    *(tie.name for tie in self.ties),
-                ]
-            )
-        )
+        names = [entry.name for body in self.bodies for entry in body.entries]
+        return tuple(dict.fromkeys([*names, *(tie.name for tie in self.ties)]))
 
     def scene(self, scene: Scene, shared: Float[Entries, "*members shared"]) -> Scene:
         """Return the scene with these shared unknowns."""

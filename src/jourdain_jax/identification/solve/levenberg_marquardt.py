@@ -83,11 +83,8 @@ class Minimum(ByMember):
     def here(self) -> tuple[Members, Arrow, ByUnknown]:
         """Return the running members, with their linearised problems and unknowns."""
         here = np.flatnonzero(self.going)
-        return (
-            here,
-            self.at.arrow if here.size == self.going.size else self.at.arrow.of(here),
-            self.theta[here],
-        )
+        arrow = self.at.arrow if here.size == self.going.size else self.at.arrow.of(here)
+        return here, arrow, self.theta[here]
 
     def arrived(self, here: Members, done: Flags) -> np.ndarray:
         """Stop the converged members (`done`), and return all others."""

@@ -104,12 +104,8 @@ class Piecewise(Problem):
     def _unknowns(self, pieces: int) -> Unknowns:
         """Return the unknowns of all pieces with their nodes."""
         whole, free = self.unknowns, unbounded(1.0)
-        ranges = self._each(
-            np.array(whole.ranges, object),
-            free,
-            free,
-            np.array([unbounded(float(size)) for size in self.node_sizes], object),
-        )
+        of_nodes = np.array([unbounded(float(size)) for size in self.node_sizes], object)
+        ranges = self._each(np.array(whole.ranges, object), free, free, of_nodes)
         means, weights = (
             self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight)
         )
@@ -193,14 +189,8 @@ class Piecewise(Problem):
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
         slopes = np.zeros((*local.shape, self.own + self.shared))
         jumps = np.full((*local.shape[:2], self.states), np.inf)
-        self.at = _Standing(
-            local.copy(),
-            whole,
-            np.empty((len(theta), len(self.runs)), object),
-            slopes,
-            np.zeros(local.shape),
-            jumps,
-        )
+        rows = np.empty((len(theta), len(self.runs)), object)
+        self.at = _Standing(local.copy(), whole, rows, slopes, np.zeros(local.shape), jumps)
         return whole.copy()
 
     def put_nodes(self, theta: ByUnknown, found: Shot) -> None:
@@ -275,13 +265,8 @@ class Piecewise(Problem):
     def _by_piece(self, theta: ByUnknown) -> Float[np.ndarray, "members pieces own_and_shared"]:
         """Return the unknowns of each piece's run, followed by the shared ones."""
         shared, own = self.unknowns.split(theta)
-        return np.concatenate(
-            [
-                own[:, self.run_of],
-                np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared)),
-            ],
-            axis=2,
-        )
+        each = np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))
+        return np.concatenate([own[:, self.run_of], each], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
         """Return the largest factor by which small changes of the unknowns grow after the first joint, in
@@ -333,14 +318,8 @@ class Piecewise(Problem):
             *(zip(zip(b, j, strict=True), plain, strict=True) for b, j, plain in some)
         ):
             rows[b, j] = one
-        new = _Standing(
-            local,
-            theta,
-            np.empty((len(theta), len(self.runs)), object),
-            0 * before.slopes,
-            0 * before.gaps,
-            np.zeros(ends.shape[:-1]),
-        )
+        whole, jumps = np.empty((len(theta), len(self.runs)), object), np.zeros(ends.shape[:-1])
+        new = _Standing(local, theta, whole, 0 * before.slopes, 0 * before.gaps, jumps)
         with np.errstate(over="ignore", invalid="ignore"):
             for i in range(len(self.follows)):
                 if not self.follows[i]:

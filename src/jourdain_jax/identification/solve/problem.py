@@ -133,12 +133,8 @@ class Problem:
         begin[0, place], fixed[place] = value, True
         # tolerance in standard errors: the value of F matters here, not the location of the minimum
         roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
-        return minimise(
-            lambda x, _: self.linearised(x, np.array([member])),
-            begin,
-            replace(unknowns, fixed=fixed),
-            roughly,
-        )
+        evaluate = lambda x, _: self.linearised(x, np.array([member]))
+        return minimise(evaluate, begin, replace(unknowns, fixed=fixed), roughly)
 
     def assembled(
         self,
@@ -149,12 +145,8 @@ class Problem:
         span: Span | None = None,
     ) -> Linearised:
         """Return the objective for evaluated residuals and these correlation times."""
-        (p, m), count, runs, kinds = (
-            self.unknowns.layout.sizes,
-            len(theta),
-            self.unknowns.runs,
-            1 + len(self.estimated),
-        )
+        (p, m), runs = self.unknowns.layout.sizes, self.unknowns.runs
+        count, kinds = len(theta), 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
         kept, sigma = np.empty((count, runs), object), np.zeros((count, 0))
@@ -242,12 +234,8 @@ class Problem:
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
         for k, (low, high) in enumerate(ends):
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
-            found = np.exp(
-                lowest(
-                    lambda x, k=k: self._restricted(theta, members, evaluated, _with(taus, k, np.exp(x)))[0],
-                    *edges,
-                )
-            )
+            of = lambda x, k=k: self._restricted(theta, members, evaluated, _with(taus, k, np.exp(x)))[0]
+            found = np.exp(lowest(of, *edges))
             interval = low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[:, k])))
             taus[:, k] = found

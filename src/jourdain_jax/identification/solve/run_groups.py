@@ -76,14 +76,8 @@ def _is_sampled(x) -> bool:
 
 
 def most_knots(runs: Sequence[Run]) -> list[int]:
-    counts = [
-        [
-            x.ts.shape[0]
-            for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled)
-            if _is_sampled(x)
-        ]
-        for run in runs
-    ]
+    leaves = [jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) for run in runs]
+    counts = [[x.ts.shape[0] for x in of_run if _is_sampled(x)] for of_run in leaves]
     return [max(column) for column in zip(*counts, strict=True)]
 
 
@@ -105,15 +99,8 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
         )
 
     if knots:
-        run = run._replace(
-            **dict(
-                zip(
-                    ("inputs", "drives"),
-                    jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled),
-                    strict=True,
-                )
-            )
-        )
+        inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
+        run = run._replace(inputs=inputs, drives=drives)
     if not more:
         return run
     ts = np.concatenate([run.ts, run.ts[-1] + 1e-6 * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
@@ -122,7 +109,7 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     )
 
 
-# members (of the requested), runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
+# indices of members in the request, runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]
 _BY_MEMBER = ("values", "weights")  # fields of a run that differ by member
 
@@ -291,14 +278,8 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     of arrays.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
-    zeros = [
-        (
-            np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
-            if isinstance(x, jax.ShapeDtypeStruct)
-            else x
-        )
-        for x in leaves
-    ]
+    zero = lambda x: np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
+    zeros = [zero(x) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]
     arrays, rest = eqx.partition(jax.tree.unflatten(treedef, zeros), is_array)
     (_, of_all), (_, of_run) = map(ravel_pytree, arrays)
 
@@ -313,10 +294,10 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
-            # dense matrices give the residuals once for each direction
+            # with dense matrices, r has one copy for each direction
             directions = np.eye(
                 max(unknowns, 1), unknowns, dtype=x.dtype
-            )  # one of no length where nothing is free
+            )  # one zero direction if nothing is free
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)))(directions)
         return jnp.concatenate([J[:unknowns], r[:1]]).T
 

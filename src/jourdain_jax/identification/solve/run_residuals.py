@@ -104,18 +104,8 @@ def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
     measured = {
         name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()
     }
-    found = Run(
-        data.t0,
-        data.ts,
-        None,
-        measured,
-        weights,
-        data.start,
-        data.inputs,
-        data.readings,
-        data.drives,
-        data.correlation_time,
-    )
+    models = data.readings, data.drives, data.correlation_time
+    found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, *models)
     return on_equal_grids([found])[0] if any(sensor.is_late for sensor in data.readings.values()) else found
 
 

@@ -91,12 +91,8 @@ class MultipleShooting:
                 "s), such as `duration=0.5`"
             )
         if self.pieces is not None:
-            checked_whole(
-                self.pieces,
-                "`pieces` of `MultipleShooting`",
-                2,
-                expected="of two or more; for one piece omit `shooting`",
-            )
+            expected = "of two or more; for one piece omit `shooting`"
+            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected=expected)
         else:
             number: Number = checked_real(
                 self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s"

@@ -134,13 +134,8 @@ def shot(problem: Piecewise, theta: Places) -> Minimum:
 
     def with_gaps(begin: np.ndarray, width: float) -> Minimum:
         what = f"pieces with gaps of {width:g}"  # in sizes of the states
-        return minimise(
-            lambda x, members: problem.with_gaps(x, members, width),
-            begin,
-            problem.pieces.unknowns,
-            roughly,
-            what,
-        )
+        evaluate = lambda x, members: problem.with_gaps(x, members, width)
+        return minimise(evaluate, begin, problem.pieces.unknowns, roughly, what)
 
     found = with_gaps(begin, 0.1)
     found = with_gaps(found.theta, 0.01).after(found, every)
@@ -216,16 +211,13 @@ def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> Non
         for place in (place for place in unknowns.layout.local if place.kind == "start"):
             where = np.arange(place.begin, place.end)
             at = problem.shared + run * problem.own + where
-            names, x = (
-                (scene.coordinate_names, q)
-                if place.name in scene.coordinate_names
-                else (scene.speed_names, u)
-            )
+            is_coordinate = place.name in scene.coordinate_names
+            names, x = (scene.coordinate_names, q) if is_coordinate else (scene.speed_names, u)
             value = names.view(x)[place.name].reshape(len(x), -1)
             free = (
                 ~unknowns.fixed[at]
                 & (unknowns.prior_weight[at] == 0)
-                & (value > low[at])
+                & (low[at] < value)
                 & (value < high[at])
             )
             local[:, first, where] = np.where(free, value, local[:, first, where])
@@ -245,7 +237,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
         here, arrow, x = way.here()
         if not here.size:
             break
-        # keeps held unknowns from making the system singular
+        # a tiny damping: held unknowns would make the system singular
         size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)
         d = damped_step(
             arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(problem, control, here)

@@ -142,13 +142,8 @@ def unknowns_of(
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if isinstance(given, PossibleInertia):
             bodies.append(inertia_of_body(scene, name))
-            numbers = zip(
-                bodies[-1].labels,
-                ("kg m^2", ""),
-                (positive(), unbounded(1.0)),
-                bodies[-1].numbers(scene),
-                strict=True,
-            )
+            units, ranges = ("kg m^2", ""), (positive(), unbounded(1.0))
+            numbers = zip(bodies[-1].labels, units, ranges, bodies[-1].numbers(scene), strict=True)
             shared += [
                 (label, "inertia", _entry(label, unit, None, default, np.asarray(guess)))
                 for label, unit, default, guess in numbers
@@ -167,13 +162,8 @@ def unknowns_of(
             continue
         about = parameters[name]
         has_sign = about["positive"] or about["non_negative"]
-        entry = _entry(
-            name,
-            about["unit"],
-            given,
-            positive() if has_sign else unbounded(),
-            np.asarray(getattr(scene, name)),
-        )
+        default = positive() if has_sign else unbounded()
+        entry = _entry(name, about["unit"], given, default, np.asarray(getattr(scene, name)))
         shared.append((name, "scene", _not_negative(entry, about["positive"]) if has_sign else entry))
     of_runs = _of_all_runs(runs)
     shared += [
