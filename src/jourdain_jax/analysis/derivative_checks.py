@@ -119,36 +119,23 @@ def gradient_checks(
         " derivative there"
     )
     cases = (relative, ""), (jax.tree.map(jnp.zeros_like, relative), left_out)
-    case = next(
-        (
-            case
-            for case in cases
-            if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)
-        ),
-        None,
-    )
+    exists = lambda change: derivative_exists(scene, t, q, u, eqx.combine(change, fixed), dq, inputs)
+    case = next((case for case in cases if exists(case[0])), None)
     if case is None:
         note = "omitted: the constraints lose rank at this state, so accelerations have no derivative there"
         return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
     change, note = case
-    arguments, point, direction = (
-        (names, weights, t, inputs, fixed, usual_rows(scene)),
-        (moving, q, u),
-        (change, dq, du),
-    )
+    arguments = (names, weights, t, inputs, fixed, usual_rows(scene))
+    point = (moving, q, u)
+    direction = (change, dq, du)
     value, forward, ends, h = along(_outcome, arguments, point, direction, u)
     size = np.abs(value) + np.abs(forward) + 1e-3 * np.sum(np.abs(weights))
     found = []
-    for name, other in (
-        ("jvp against vjp", _reverse(arguments, point, direction)),
-        ("differences", central_difference(ends, h)),
-    ):
+    reverse, differences = _reverse(arguments, point, direction), central_difference(ends, h)
+    for name, other in (("jvp against vjp", reverse), ("differences", differences)):
         errors = np.abs(forward - other) / size
-        found.append(
-            check(
-                name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note
-            )
-        )
+        by_way = {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}
+        found.append(check(name, by_way, u.dtype, note))
     return found
 
 
@@ -165,11 +152,9 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
 
 def by_reduction(way, scene, t, q, u, equations, rows):
     """Apply one reduction to shared equations and constraints."""
-    return (
-        way.accelerations(scene, t, q, u, equations, rows)
-        if isinstance(way, GibbsAppell)
-        else reduce(way, equations, rows)
-    )
+    if isinstance(way, GibbsAppell):
+        return way.accelerations(scene, t, q, u, equations, rows)
+    return reduce(way, equations, rows)
 
 
 @eval_numpy

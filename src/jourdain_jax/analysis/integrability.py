@@ -261,12 +261,10 @@ class _Fields:
     """
 
     def __init__(self, scene: Scene, with_time: bool, u):
-        self.scene, self.with_time, self.u, self.rows = (
-            scene,
-            with_time,
-            np.asarray(u, float),
-            RowsOverStates(scene),
-        )
+        self.scene = scene
+        self.with_time = with_time
+        self.u = np.asarray(u, float)
+        self.rows = RowsOverStates(scene)
         # indices in (1, u)
         self.free = [0, *(1 + i for i in structure_of(scene).independent)]
         self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
@@ -293,8 +291,6 @@ class _Fields:
     def _solved(self, a: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return `-a_z^-1 right`, with a_z for the dependent speeds."""
         a_z = a[:, :, self.dependent]
-        return (
-            -np.linalg.solve(a_z, right)
-            if a_z.shape[1] == a_z.shape[2]
-            else -np.linalg.pinv(a_z, rcond=1e-12) @ right
-        )
+        if a_z.shape[1] == a_z.shape[2]:
+            return -np.linalg.solve(a_z, right)
+        return -np.linalg.pinv(a_z, rcond=1e-12) @ right

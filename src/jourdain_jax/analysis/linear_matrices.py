@@ -43,22 +43,10 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     rates = xp.concatenate([rates, along[constant] @ T])
     n = len(kept) + len(y)
     A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
-    found = dict(
-        zip(
-            ("M", "C", "K", "F", "coupling"),
-            _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates),
-            strict=True,
-        )
-    )
-    acceleration = largest(v[constant])
-    residual = xp.maximum(acceleration, largest(change))
-    found |= {
-        "A": A,
-        "B": B,
-        "acceleration": acceleration,
-        "residual": residual,
-        "pivot": xp.minimum(*pivots),
-    }
+    second = _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates)
+    found = dict(zip(("M", "C", "K", "F", "coupling"), second, strict=True))
+    found |= {"A": A, "B": B, "acceleration": largest(v[constant]), "pivot": xp.minimum(*pivots)}
+    found["residual"] = xp.maximum(found["acceleration"], largest(change))
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 

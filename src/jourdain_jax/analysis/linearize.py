@@ -85,13 +85,11 @@ class Linearization(Printed, eqx.Module):
                 f"Linearizations of shape {self.A.shape[:-2]}; named coordinates:"
                 f" {', '.join(self.coordinates) or 'none'}"
             )
-        lines, names = (
-            [
-                f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
-                f"pivot {float(self.pivot):.2g}"
-            ],
-            self.coordinates,
-        )
+        lines = [
+            f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
+            f"pivot {float(self.pivot):.2g}"
+        ]
+        names = self.coordinates
         if names:
             lines += [
                 line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)

@@ -61,11 +61,9 @@ class Places(NamedTuple):
 
 def places_of(scene: Scene) -> Places:
     """Return the positions for a scene."""
-    n, m, geometric = (
-        len(scene.coordinate_names.entries),
-        len(scene.speed_names.entries),
-        len(names_of_position_rows(scene)),
-    )
+    n = len(scene.coordinate_names.entries)
+    m = len(scene.speed_names.entries)
+    geometric = len(names_of_position_rows(scene))
     of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
     return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
 

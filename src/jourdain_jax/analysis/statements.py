@@ -165,11 +165,9 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     value, change, around, h = along(_at, (fixed, inputs), point, direction, u)
     values = {}
     for name in value:
-        f, slope, ends = (
-            np.asarray(value[name]),
-            np.asarray(change[name]),
-            [np.asarray(x[name]) for x in around],
-        )
+        f = np.asarray(value[name])
+        slope = np.asarray(change[name])
+        ends = [np.asarray(x[name]) for x in around]
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order if f is smooth, the jump of the
         # slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)

@@ -82,21 +82,17 @@ class _Reader(GeomReader):
         joints = [
             joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")
         ]
-        name, motors, ties = (
-            self.file.root.get("model") or "Mjcf",
-            tuple(self._motors(joints)),
-            tuple(self._ties(joints)),
-        )
+        name = self.file.root.get("model") or "Mjcf"
+        motors = tuple(self._motors(joints))
+        ties = tuple(self._ties(joints))
         return Tree(name, tuple(self.links), gravity, motors, ties, free, self.start)
 
     def _ties(self, joints: list[str]) -> Iterable[Follower | Closure]:
         """Yield the exact constraints that `equality` states."""
         stated = () if "equality" in self.file.ignore else self.file.root.findall("equality/*")
         for k, element in enumerate(stated):
-            tie, follows = (
-                Part(self.file, f"{element.tag} {k + 1} of `equality`", element),
-                element.tag == "joint",
-            )
+            tie = Part(self.file, f"{element.tag} {k + 1} of `equality`", element)
+            follows = element.tag == "joint"
             one, other = (element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2))
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
@@ -176,11 +172,9 @@ class _Reader(GeomReader):
         low, high = given.numbers("range", 2, [0.0, 0.0]) * unit
         if reference and kind in ("hinge", "slide"):
             self.start[identifier(name)] = reference * unit
-        axis, anchor, limits = (
-            given.direction("axis", [0.0, 0.0, 1.0]),
-            given.numbers("pos", 3, np.zeros(3)),
-            (float(low), float(high)) if low < high else None,
-        )
+        axis = given.direction("axis", [0.0, 0.0, 1.0])
+        anchor = given.numbers("pos", 3, np.zeros(3))
+        limits = (float(low), float(high)) if low < high else None
         return Joint(name, kind, axis, anchor, reference * unit, damping, stiffness, rest * unit, limits)
 
     def _motors(self, names: list[str]) -> Iterable[Motor]:
@@ -188,11 +182,9 @@ class _Reader(GeomReader):
         for k, element in enumerate(self.file.root.findall("actuator/motor")):
             motor = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`")
             joint, site = motor.given.get("joint", ""), motor.given.get("site")
-            name, gear, push = (
-                element.get("name") or f"{site or joint}_motor",
-                motor.numbers("gear", None, [1.0]),
-                None,
-            )
+            name = element.get("name") or f"{site or joint}_motor"
+            gear = motor.numbers("gear", None, [1.0])
+            push = None
             motor.what = f"motor `{name}`"
             if site is not None:
                 self.file.check_name(site, self.sites, f"{motor.what} pushes the unknown site `{site}`")

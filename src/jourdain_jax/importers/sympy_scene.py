@@ -76,21 +76,14 @@ class SympyScene(Scene):
     def loads(self, motion):
         """Return SymPy's loads; constant ones have a potential."""
         kinds: dict[str, dict] = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
-        for (kind, name), value in self._expressions.values(
-            "loads", self, motion.t, motion.q, motion.u, motion.inputs
-        ).items():
+        values = self._expressions.values("loads", self, motion.t, motion.q, motion.u, motion.inputs)
+        for (kind, name), value in values.items():
             kinds[kind][name] = value[0] if kind == "generalized" else jnp.stack(value)
         weights, *others = kinds.values()
-        found = (
-            [
-                Load(
-                    forces=weights,
-                    potential=-sum(force @ motion[name].position for name, force in weights.items()),
-                )
-            ]
-            if weights
-            else []
-        )
+        found = []
+        if weights:
+            potential = -sum(force @ motion[name].position for name, force in weights.items())
+            found.append(Load(forces=weights, potential=potential))
         return (*found, Load(*others)) if any(others) else tuple(found)
 
     def geometric_constraints(self, pose):

@@ -90,12 +90,10 @@ class TreeScene(Scene):
                     moved[one.joint] - expected
                 )
                 continue
-            (R, r), (other_R, other_r), (S, s), (other_S, other_s) = (
-                now[one.link],
-                now[one.other],
-                stated[one.link],
-                stated[one.other],
-            )
+            R, r = now[one.link]
+            other_R, other_r = now[one.other]
+            S, s = stated[one.link]
+            other_S, other_s = stated[one.other]
             found[one.name] = (
                 r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
             )

@@ -172,16 +172,8 @@ class _Reader:
             )
             raise self.file.fault(f"expected one link without a parent, the root; {found}")
         at_root = () if base == "fixed" else (Joint("", base),)
-        links = [
-            Link(
-                roots[0],
-                None,
-                np.zeros(3),
-                np.eye(3),
-                at_root,
-                *self._content(self.links[roots[0]], base != "fixed"),
-            )
-        ]
+        content = self._content(self.links[roots[0]], base != "fixed")
+        links = [Link(roots[0], None, np.zeros(3), np.eye(3), at_root, *content)]
         for link in links:  # the list grows during the loop
             links += [
                 self._link(name, joint, parent)

@@ -63,34 +63,18 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
         # the stated domain, slightly widened, for coordinates on which constraints depend
-        bounded, more = (
-            coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries],
-            NEARLY_INSIDE * (high - low),
-        )
+        bounded = coordinates_on_rows(scene) & [
+            name in scene.domain for name in scene.coordinate_names.entries
+        ]
+        more = NEARLY_INSIDE * (high - low)
         low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
         affine = structure_whatever_its_faults(scene).affine
-        return Usual(
-            closure_lengths(scene),
-            rows,
-            width,
-            low.astype(width.dtype),
-            high.astype(width.dtype),
-            affine,
-            determined,
-            program,
-        )
+        low, high = (x.astype(width.dtype) for x in (low, high))
+        return Usual(closure_lengths(scene), rows, width, low, high, affine, determined, program)
     except ValueError:  # the scene is invalid, which is reported when its structure is requested
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return Usual(
-            np.zeros(geometric + norms),
-            np.zeros(len(names_of_rows(scene))),
-            width,
-            -np.inf * width,
-            np.inf * width,
-            False,
-            False,
-            None,
-        )
+        no_lengths = np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene)))
+        return Usual(*no_lengths, width, -np.inf * width, np.inf * width, False, False, None)
 
 
 def put_positions(

@@ -129,14 +129,8 @@ def _follow(
     # its value beyond the event may be NaN
     newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)
     shift = w.where(trying, w.where(near, 0.0, tried - t_0), newton)
-    rows = {
-        "t": t,
-        "c": [x for part in c for x in part],
-        "step": [step],
-        "left": [left],
-        "shift": [shift],
-        "slope": slope,
-    }
+    c = [x for part in c for x in part]
+    rows = {"t": t, "c": c, "step": [step], "left": [left], "shift": [shift], "slope": slope}
     for name, values in rows.items():
         p.put(f"search_{name}", _each(w, changes, values, p.every(f"search_{name}")))
     return first

@@ -64,10 +64,8 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
         straight = (slope >= low) & (slope <= high)
         t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
         least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
-        low, high = (
-            jnp.where(straight, jnp.maximum(low, least), least),
-            jnp.where(straight, jnp.minimum(high, most), most),
-        )
+        low = jnp.where(straight, jnp.maximum(low, least), least)
+        high = jnp.where(straight, jnp.minimum(high, most), most)
         return (t_a, v_a, t_k, v_k, low, high), ~straight
 
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
@@ -101,10 +99,8 @@ def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel
-        return (
-            SeenFromWithin(sampled, jax.lax.stop_gradient(middle))
-            if isinstance(sampled, Sampled)
-            else channel
-        )
+        if isinstance(sampled, Sampled):
+            return SeenFromWithin(sampled, jax.lax.stop_gradient(middle))
+        return channel
 
     return Inputs(tuple(within(channel) for channel in inputs.channels))

@@ -84,11 +84,9 @@ class Inputs(eqx.Module):
 
     def __call__(self, t) -> Float[Array, "inputs"]:
         """Return the vector of inputs at time t."""
-        return (
-            jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels])
-            if self.channels
-            else jnp.zeros(0)
-        )
+        if self.channels:
+            return jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels])
+        return jnp.zeros(0)
 
     @property
     def constant(self) -> bool:

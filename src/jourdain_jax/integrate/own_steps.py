@@ -72,12 +72,10 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if setup.reason_against_machine_code:
-            run, pull, mover, reason = (
-                self._on_arrays,
-                self._pulled_on_arrays,
-                on_arrays.mover,
-                lambda: SECOND_ORDER_MESSAGE,
-            )
+            run = self._on_arrays
+            pull = self._pulled_on_arrays
+            mover = on_arrays.mover
+            reason = lambda: SECOND_ORDER_MESSAGE
         else:
             form = self._form(setup)
             run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)

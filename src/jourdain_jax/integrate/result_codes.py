@@ -15,24 +15,20 @@ Codes up to `EVENT` mark motions that reached the end of their span or an event;
     BAD_START,
     UNSOLVED_STEP,
 ) = range(10)
-SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = (
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-    16,
-    17,
-)
-TOO_MANY_TRANSITIONS, IMPACT_GAINS_ENERGY, PAINLEVE, CONTACTS_UNDECIDED, LIES_FLAT, STICKS = (
-    18,
-    19,
-    20,
-    21,
-    22,
-    23,
-)
+SHRANK = 10
+STIFF = 11
+OFF_CONSTRAINTS = 12
+BAD_TIMES = 13
+ENERGY_LOST = 14
+PROCESS_DIED = 15
+CONTRADICTORY_ROWS = 16
+UNRESOLVED = 17
+TOO_MANY_TRANSITIONS = 18
+IMPACT_GAINS_ENERGY = 19
+PAINLEVE = 20
+CONTACTS_UNDECIDED = 21
+LIES_FLAT = 22
+STICKS = 23
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 
 MESSAGES = {

@@ -136,13 +136,8 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        shares = {
-            "ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype),
-            "t0": 0.0,
-            "t1": 1.0,
-            "dt0": 0.1,
-            "longest": 1.0,
-        }
+        even = jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype)
+        shares = {"ts": even, "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
         # 1e-9 s, for motions that are not requested
         return self._replace(
             **{

@@ -68,10 +68,8 @@ class State(Printed, eqx.Module):
                 f"States of shape {self.q.shape[:-1]}:"
                 f" {', '.join((*self.names[0].entries, *self.names[1].entries))}"
             )
-        entries, values = (
-            (*self.names[0].entries, *self.names[1].entries),
-            in_digits(np.concatenate([self.q, self.u])),
-        )
+        entries = (*self.names[0].entries, *self.names[1].entries)
+        values = in_digits(np.concatenate([self.q, self.u]))
         pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
         moved = (
             f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual"
@@ -126,19 +124,15 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
     The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
     """
-    given_q, u, free, usual = (
-        jnp.asarray(start.q),
-        jnp.asarray(start.u),
-        jnp.asarray(start.free_q),
-        start.usual,
-    )
+    given_q = jnp.asarray(start.q)
+    u = jnp.asarray(start.u)
+    free = jnp.asarray(start.free_q)
+    usual = start.usual
     q = given_q
     here, at, begin = jax.lax.stop_gradient((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
-    arrived, found = (
-        _arrived(begin, near_q, g, start),
-        _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True)),
-    )
+    arrived = _arrived(begin, near_q, g, start)
+    found = _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
     if guesses is not None and len(usual.closures):
         other = jax.lax.cond(
             eqxi.unvmap_any(~arrived),
@@ -158,17 +152,8 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
         jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left)
     )
     names = scene.coordinate_names, scene.speed_names
-    state = State(
-        jnp.asarray(t),
-        near_q,
-        near_u,
-        moved_q,
-        moved_u,
-        jnp.where(right, residual, jnp.inf),
-        names,
-        guess.astype(q.dtype),
-    )
-    return state, arrived
+    moved = moved_q, moved_u, jnp.where(right, residual, jnp.inf)
+    return State(jnp.asarray(t), near_q, near_u, *moved, names, guess.astype(q.dtype)), arrived
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:

@@ -158,12 +158,10 @@ class WhippleBicycle(Scene):
         a ball.
         """
         on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)
-        head, top, hub, saddle = (
-            on_axis(-2.1 * self.rF),
-            on_axis(-2.6 * self.rF),
-            (0.0, -self.rR),
-            (0.26 * self.w, -2.5 * self.rR),
-        )
+        head = on_axis(-2.1 * self.rF)
+        top = on_axis(-2.6 * self.rF)
+        hub = (0.0, -self.rR)
+        saddle = (0.26 * self.w, -2.5 * self.rR)
         crank = (0.42 * self.w, -0.85 * self.rR)
         bars = {
             "rear frame": (self.xB, self.zB, (hub, crank, head, saddle, crank)),

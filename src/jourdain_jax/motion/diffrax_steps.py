@@ -158,10 +158,8 @@ class Diffrax(eqx.Module, Integrator):
             t_end, y_end = jax.tree.map(
                 lambda first, last: jnp.where(happened, first, last), (t0, begun.y0), (t_end, y_end)
             )
-            reached, code = (
-                reached & (~happened | (found_ts == t0)),
-                jnp.where(happened, result_codes.EVENT, code),
-            )
+            reached = reached & (~happened | (found_ts == t0))
+            code = jnp.where(happened, result_codes.EVENT, code)
             event_index = jnp.where(happened, jnp.argmax(over).astype(jnp.int32), event_index)
         return Solved(
             ts=found_ts,

@@ -113,14 +113,8 @@ def _plain(setup: Setup) -> Plain:
     setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
     own = setup.fitting()
     times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
-    return Plain(
-        times,
-        tuple(
-            native_motion.known_of(
-                (setup.field, setup.scene, setup.inputs, setup.field.fixed(setup.scene), setup.t0)
-            )
-        ),
-    )
+    args = setup.field, setup.scene, setup.inputs, setup.field.fixed(setup.scene), setup.t0
+    return Plain(times, tuple(native_motion.known_of(args)))
 
 
 def _in_contact(setup: Setup) -> Setup:
@@ -168,10 +162,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
 
     def saved_state(tau, y, valid):
         # unreached times may hold any value: compute at the end state, then mark as NaN
-        tau, y = (
-            jnp.where(valid, tau, solved.t_end),
-            jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end),
-        )
+        tau = jnp.where(valid, tau, solved.t_end)
+        y = jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
         _, at = integrands.at_time(tau, y, args)
         u, pivot = field.speeds_and_pivot(at)
@@ -248,11 +240,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         inputs=in_phases(given.inputs, transitions, solved.passed.modes, direction),
         phases=_phases(given.inputs, passed, solved.passed, integrator.event_names, given.scene.modes),
         state_form=field.name,
-        reduction=(
-            field.reduction_name
-            if setup.reason_against_machine_code
-            else f"{field.reduction_name} to machine code"
-        ),
+        reduction=field.reduction_name + ("" if setup.reason_against_machine_code else " to machine code"),
         solver=integrator.name,
         projected=field.projects,
         unwatched=unwatched,
@@ -267,17 +255,10 @@ def _phases(
     there = jnp.isfinite(ts)
     first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
     modes = passed.modes if len(passed.modes) == len(first) else jnp.zeros((len(first), 0))
-    return Phases(
-        ts,
-        jnp.where(there, passed.events, -1),
-        jnp.concatenate(
-            [jnp.stack(first)[:, None] if first else jnp.zeros((0, 1)), jnp.where(there, modes, jnp.nan)],
-            axis=1,
-        ),
-        jnp.where(there, passed.lost, 0.0),
-        names,
-        named,
-    )
+    before = jnp.stack(first)[:, None] if first else jnp.zeros((0, 1))
+    modes = jnp.concatenate([before, jnp.where(there, modes, jnp.nan)], axis=1)
+    events, lost = jnp.where(there, passed.events, -1), jnp.where(there, passed.lost, 0.0)
+    return Phases(ts, events, modes, lost, names, named)
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:

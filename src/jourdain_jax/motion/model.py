@@ -86,11 +86,9 @@ class Model(BuiltFor, Printed):
 
     def inputs(self, given) -> Inputs:
         """Return inputs given by name; the default is cached."""
-        return (
-            self.once("inputs at rest", lambda: as_inputs(self.scene, None))
-            if given is None
-            else as_inputs(self.scene, given)
-        )
+        if given is None:
+            return self.once("inputs at rest", lambda: as_inputs(self.scene, None))
+        return as_inputs(self.scene, given)
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
         """Return the result of `make` for these parameters, computed once per case."""
@@ -125,13 +123,9 @@ class Model(BuiltFor, Printed):
         """Return the independent speeds."""
         known, names = self.structure, self.scene.speed_names.entries
         dependent = tuple(name for i, name in enumerate(names) if i not in known.independent)
-        return Freedoms(
-            tuple(names[i] for i in known.independent),
-            dependent,
-            known.chosen_by_user,
-            known.worst_pivot,
-            known.typical_pivot,
-        )
+        independent = tuple(names[i] for i in known.independent)
+        pivots = known.worst_pivot, known.typical_pivot
+        return Freedoms(independent, dependent, known.chosen_by_user, *pivots)
 
     @property
     def dependence(self) -> Dependence:
@@ -275,11 +269,9 @@ class Model(BuiltFor, Printed):
             return "as requested"
         if self.state == "minimal":
             return "independent speeds determine the others over the domain"
-        return (
-            "independent speeds do not determine the others over the whole domain"
-            if known.affine
-            else "constraints are nonlinear in the speeds"
-        )
+        if known.affine:
+            return "independent speeds do not determine the others over the whole domain"
+        return "constraints are nonlinear in the speeds"
 
 
 def _decisions_where_traced(scene: Scene) -> tuple:

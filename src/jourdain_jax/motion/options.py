@@ -114,10 +114,8 @@ OPTION_NAMES = tuple(OptionFields.__annotations__)
 def _register(kind: type[Options]) -> None:
     """Register a class of options as a pytree whose leaves may be any object."""
     names = [field.name for field in fields(kind)]
-    leaves, static = (
-        [name for name in names if name not in _STATIC],
-        [name for name in names if name in _STATIC],
-    )
+    leaves = [name for name in names if name not in _STATIC]
+    static = [name for name in names if name in _STATIC]
 
     def unflattened(known: tuple, values) -> Options:
         options = object.__new__(kind)

@@ -74,10 +74,8 @@ def lanes_retried(
                 size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))
                 index = chosen[np.minimum(np.arange(first, first + size), len(chosen) - 1)]
                 new = run(changed, index)
-                lanes, reruns[way] = (
-                    _replaced(lanes, _marked(new, way), index),
-                    tuple(getattr(new, name) for name in RERUN_FIELDS),
-                )
+                lanes = _replaced(lanes, _marked(new, way), index)
+                reruns[way] = tuple(getattr(new, name) for name in RERUN_FIELDS)
     return lanes, tuple(sorted(reruns.items()))
 
 
@@ -86,11 +84,9 @@ def _next_retries(
 ) -> Int[np.ndarray, "lanes"]:
     """Return the next retry of each sample, including all earlier changes of its run; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
-    found, codes, fallback = (
-        np.full(lanes.result.shape, result_codes.AS_ASKED),
-        np.asarray(lanes.result),
-        np.asarray(lanes.fallback),
-    )
+    found = np.full(lanes.result.shape, result_codes.AS_ASKED)
+    codes = np.asarray(lanes.result)
+    fallback = np.asarray(lanes.fallback)
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))

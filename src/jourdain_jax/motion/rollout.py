@@ -110,10 +110,8 @@ class Rollout(Printed, eqx.Module):
                 "lanes have different saved times, so there are no common quantiles; pass one "
                 "start time for all, or one `ts`"
             )
-        values, quantiles = (
-            np.asarray(self[name]),
-            np.asarray(checked_real(levels, "`levels`", advice="pass numbers from 0 to 1")),
-        )
+        values = np.asarray(self[name])
+        quantiles = np.asarray(checked_real(levels, "`levels`", advice="pass numbers from 0 to 1"))
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
         out = np.full((len(levels), *values.shape[1:]), np.nan)
@@ -269,10 +267,10 @@ def rollout(
         pieces.append(jax.block_until_ready(piece) if chunk == count else jax.tree.map(np.asarray, piece))
         bar.update(min(chunk, count - first))
     bar.close()
-    lanes, reruns = (
-        pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces),
-        (),
+    lanes = (
+        pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
     )
+    reruns = ()
     if options.retry:
         own_times = isinstance(varied, State) and span["t0"] is None
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]

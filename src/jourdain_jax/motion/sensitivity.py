@@ -100,10 +100,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
         first = sizes(begun) if begun else np.zeros_like(ended)  # zero if nothing varies the start
         half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
         with np.errstate(divide="ignore", invalid="ignore"):
-            from_start, from_middle = (
-                np.where(first > 0, ended / first, np.inf),
-                np.where(half > 0, (ended / half) ** 2, 0.0),
-            )
+            from_start = np.where(first > 0, ended / first, np.inf)
+            from_middle = np.where(half > 0, (ended / half) ** 2, 0.0)
         grown = (
             np.where(first > 0, from_start, 0.0)
             if varies == ("start",)
@@ -153,8 +151,6 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
 def numbers_where_known(values):
     """Return the values as numbers if they are differentiated outside `jit`; None if they are traced."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
-    return (
-        None
-        if is_traced(bare)
-        else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)
-    )
+    if is_traced(bare):
+        return None
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)

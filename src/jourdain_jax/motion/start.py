@@ -102,11 +102,9 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
 
 def _as_input_vector(scene: Scene, inputs, dtype):
     """Return the input vector; a NumPy vector is returned without tracing."""
-    return (
-        inputs
-        if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),)
-        else as_input_vector(scene, inputs, dtype)
-    )
+    if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),):
+        return inputs
+    return as_input_vector(scene, inputs, dtype)
 
 
 # one program for every choice of held variables

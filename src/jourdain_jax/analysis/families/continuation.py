@@ -121,11 +121,8 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
 
 def across(equations: Motions, tangent: Vector) -> Point:
     """Return the branch point at the guess, with the tangent of the other curve through it."""
-    other, look = (
-        min(
-            tangents_across(equations, equations.start),
-            key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent),
-        ),
-        equations(equations.start),
+    other = min(
+        tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent)
     )
+    look = equations(equations.start)
     return Point(equations.start, other, look, equations.eigenvalues(look, other))

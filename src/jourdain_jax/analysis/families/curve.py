@@ -103,11 +103,9 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
                 if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
                     points[-1] = end
                 left = _left(equations, points[-1])
-                return (
-                    (points[:-1], left)
-                    if left
-                    else (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
-                )
+                if left:
+                    return (points[:-1], left)
+                return (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
         if left := _left(equations, there):
             return points[:-1], left
         if _closed(equations, start, here, there):

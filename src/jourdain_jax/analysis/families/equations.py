@@ -121,10 +121,8 @@ class SteadyEquations(Motions):
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
         varied = [getattr(numbered(scene), name) for name in vary]
         self.instant = by_program(scene, program, (), tuple(varied))
-        matters, bound = (
-            np.array([name not in program.held for name in program.coordinates], bool),
-            on_rows(scene),
-        )
+        matters = np.array([name not in program.held for name in program.coordinates], bool)
+        bound = on_rows(scene)
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([self.instant.states[0] - 1 + columns, varied]).astype(int)
@@ -137,10 +135,8 @@ class SteadyEquations(Motions):
         )
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
-        self.rates, self.states = (
-            np.concatenate([at.qdot[kept], at.udot[y]]),
-            np.concatenate([at.q[kept], at.u[y]]),
-        )
+        self.rates = np.concatenate([at.qdot[kept], at.udot[y]])
+        self.states = np.concatenate([at.q[kept], at.u[y]])
         self.of_states = np.concatenate([at.g, at.phi if len(y) == len(at.u) else []]).astype(int)
         columns = np.append(columns, np.arange(-len(vary), 0))
         self.slopes = (

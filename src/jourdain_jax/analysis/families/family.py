@@ -145,21 +145,12 @@ class Family(Printed):
     def point(self, point: Point, kind: str = "", columns: Indices = ()) -> FamilyPoint:
         """Return a point of the curve with its state and eigenvalues."""
         known = self.equations
-        values, entries = (
-            known.values(point.z),
-            (known.scene.coordinate_names.entries, known.scene.speed_names.entries),
-        )
+        values = known.values(point.z)
+        entries = (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
         q, u = (jnp.array([values[name] for name in names]) for names in entries)
         state = state_of(known.scene, known.t, q, u, residual=largest(point.look.R))
-        return FamilyPoint(
-            kind,
-            state,
-            point.modes,
-            tuple(self.mode_names[k] for k in columns),
-            values,
-            point.tangent * known.size,
-            known.modes,
-        )
+        modes, tangent = tuple(self.mode_names[k] for k in columns), point.tangent * known.size
+        return FamilyPoint(kind, state, point.modes, modes, values, tangent, known.modes)
 
     def to_xarray(self):
         """Return points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their

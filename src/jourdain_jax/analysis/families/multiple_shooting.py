@@ -135,12 +135,10 @@ class Shooting(eqx.Module):
         """Return the eigenvalues of the product M_n .. M_1, largest first, from df_k/dz_k and f_k. If the
         period is unknown, the eigenvalue of motion along the orbit is omitted.
         """
-        (zs, period), kept, known, n = (
-            self.pieces_of(x),
-            np.array(self.kept),
-            structure_of(self.scene),
-            self.pieces,
-        )
+        zs, period = self.pieces_of(x)
+        kept = np.array(self.kept)
+        known = structure_of(self.scene)
+        n = self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
         rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
         count = len(places) - int(rank) + known.degrees_of_freedom

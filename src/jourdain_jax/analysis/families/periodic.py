@@ -190,18 +190,8 @@ def periodic(
     free = tuple(k for k in kept if names[k] not in held)
     shifts = (checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names)
     shifted = jnp.stack([*shifts]).astype(start.q.dtype)
-    problem = Shooting(
-        scene,
-        inputs,
-        options,
-        shifted,
-        instant,
-        pieces,
-        None if until is None else events.index(until),
-        kept,
-        free,
-        tuple(shift),
-    )
+    event = None if until is None else events.index(until)
+    problem = Shooting(scene, inputs, options, shifted, instant, pieces, event, kept, free, tuple(shift))
     return _found(problem, start, period.astype(start.q.dtype))
 
 
@@ -213,10 +203,8 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
     zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
     guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
     size = jnp.where(problem.is_unknown, jnp.append(jnp.tile(problem.sizes, problem.pieces), given), 0.0)
-    rows, tolerance = (
-        lambda x: problem.rows(t, x, problem.ends(t, x)),
-        10.0 * jnp.asarray(problem.options.rtol),
-    )
+    rows = lambda x: problem.rows(t, x, problem.ends(t, x))
+    tolerance = 10.0 * jnp.asarray(problem.options.rtol)
     x = smooth_root(lambda x: still.look(t, x)[:2], rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
     D, _, ends = problem.slopes(t, x)
@@ -234,16 +222,8 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
         if k not in problem.kept or name in problem.shifted
     }
     state = state_of(problem.scene, t, *problem.split(zs[0]), start.moved_q, start.moved_u, residual)
-    return PeriodicMotion(
-        state,
-        period,
-        shifts,
-        problem.multipliers(t, x, D, ends),
-        residual,
-        (residual < 1e-8) & goes_on,
-        problem,
-        x,
-    )
+    multipliers, converged = problem.multipliers(t, x, D, ends), (residual < 1e-8) & goes_on
+    return PeriodicMotion(state, period, shifts, multipliers, residual, converged, problem, x)
 
 
 class OrbitEquations(Motions):
@@ -258,12 +238,10 @@ class OrbitEquations(Motions):
     )
 
     def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: Labels, held: Labels) -> None:
-        self.scene, self.vary, self.problem, self.t = (
-            scene,
-            vary,
-            replace(orbit.by, scene=scene),
-            orbit.state.t,
-        )
+        self.scene = scene
+        self.vary = vary
+        self.problem = replace(orbit.by, scene=scene)
+        self.t = orbit.state.t
         names = state_names(scene)
         pieces = [f"{name} in piece {k + 1}" if k else name for k in range(orbit.by.pieces) for name in names]
         self.given = np.append(np.asarray(orbit.unknowns), [float(getattr(scene, name)) for name in vary])

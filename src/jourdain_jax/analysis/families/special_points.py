@@ -53,11 +53,9 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
     slope = low - curvature * before
     s = -slope / (2 * curvature) if curvature * b > 0 else after
     near = min(abs(s - x) for x in at) < 1e-4 * (after - before)
-    return (
-        s
-        if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b)
-        else None
-    )
+    if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b):
+        return s
+    return None
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:

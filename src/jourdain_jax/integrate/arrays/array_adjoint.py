@@ -113,10 +113,8 @@ def cotangents(
 
     w = of.writer(start, asked)
     known = sum(w.functions.sizes())
-    g, by_known = (
-        w.holding(added(g_end, end.passed, jnp.full(lanes, len(start.goals), jnp.int32))),
-        w.room(max(known, 1)),
-    )
+    g = w.holding(added(g_end, end.passed, jnp.full(lanes, len(start.goals), jnp.int32)))
+    by_known = w.room(max(known, 1))
     if form.has_events:
         state = of.rows_in(w, end, fixed)
         located = is_located(w, Lanes(w, form, state))

@@ -260,10 +260,8 @@ class Functions:
         """Pull cotangents back through the state after an event. The cotangent of the event's time is added
         after the arrays' cotangents.
         """
-        known, of_state = (
-            sum(self.sizes()),
-            lambda y, *shared: self._reset(event, t, y, *shared)[: self.count],
-        )
+        known = sum(self.sizes())
+        of_state = lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
         self._pull(of_state, y, g, self.count, to_y, to_known)
         at, g_y = self.w.load(y, self.y), self.w.load(g, self.y)
         by_time = jax.vjp(lambda t: self._reset(event, t, at, *self.shared[0])[: self.count], t)[1](g_y)[0]

@@ -97,14 +97,8 @@ class Loop(NamedTuple):
         """Try a step in all running samples. Return also the rates at its stages."""
         w = self.writer(start)
         state, k = self.rows_in(w, going, fixed), w.room(self.form.integrated * self.method.needed)
-        step(
-            w,
-            self.form,
-            self.method,
-            Lanes(w, self.form, state),
-            k,
-            tried_by_stages if isinstance(self.method, Method) else tried_by_equations,
-        )
+        tried = tried_by_stages if isinstance(self.method, Method) else tried_by_equations
+        step(w, self.form, self.method, Lanes(w, self.form, state), k, tried)
         return going._replace(
             y=w.load(state, Rows(0, self.form.integrated)),
             rows={row: w.load(state, row) for row in going.rows},

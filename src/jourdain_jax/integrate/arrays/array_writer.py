@@ -92,11 +92,9 @@ class ArrayWriter:
 
     def _place(self, pointer: Pointer, index) -> tuple[Any, int]:
         """Return the first row and the number of rows."""
-        return (
-            (pointer.first + index.first, index.many)
-            if isinstance(index, Rows)
-            else (pointer.first + index, 1)
-        )
+        if isinstance(index, Rows):
+            return pointer.first + index.first, index.many
+        return pointer.first + index, 1
 
     def load(self, pointer: Pointer, index=0) -> Array:
         """Return a row, or rows as one array."""

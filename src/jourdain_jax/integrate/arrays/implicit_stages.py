@@ -56,12 +56,10 @@ def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) 
     """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its
     sign or a constraint reversed.
     """
-    at, pivots, halves, every = (
-        w.room(form.integrated),
-        w.room(max(len(form.monitored), 1)),
-        w.table([0.0, 0.5, 1.0]),
-        form.integrated,
-    )
+    at = w.room(form.integrated)
+    pivots = w.room(max(len(form.monitored), 1))
+    halves = w.table([0.0, 0.5, 1.0])
+    every = form.integrated
 
     def state(i, row):
         start = w.load(p.pointer, row)

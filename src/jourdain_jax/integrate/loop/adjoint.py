@@ -110,10 +110,8 @@ def _write_note(w: MachineWriter, form: Form) -> None:
                         & lanes.of("t", lane).equals(lanes.of("goal", lane))
                     )
                 )
-                before, goals = (
-                    w.converted("fptosi", w.load(saved, lane, "double"), "i64"),
-                    w.load(job, GOALS, "ptr"),
-                )
+                before = w.converted("fptosi", w.load(saved, lane, "double"), "i64")
+                goals = w.load(job, GOALS, "ptr")
                 if form.sampled:
                     at_knot = lanes.of("t", lane).differs(goal_of(w, job, goals, number, before))
                     with w.when(at_knot):

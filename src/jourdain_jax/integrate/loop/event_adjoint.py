@@ -50,10 +50,8 @@ def write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
                 passed = lanes.of("passed", lane) - 1.0
                 lanes.set("passed", lane, passed)
                 with w.when(passed < float(form.transitions)):
-                    end, first = (
-                        _cotangents_of_end(w, form, job, number),
-                        w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving)),
-                    )
+                    end = _cotangents_of_end(w, form, job, number)
+                    first = w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving))
                     for part in range(1 + len(form.moving)):
                         g_of = w.load(end.place(first + part * form.transitions), type="double")
                         w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))

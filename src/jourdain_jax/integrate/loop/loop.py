@@ -89,11 +89,8 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
     array of the times of each sample.
     """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
-    of_samples, arguments, times = (
-        arguments[: arguments_of_samples(form)],
-        arguments[arguments_of_samples(form) :],
-        arguments[-1],
-    )
+    first = arguments_of_samples(form)
+    of_samples, arguments, times = arguments[:first], arguments[first:], arguments[-1]
     arrays = [x.data for x in (*arguments, *results)]
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
@@ -120,11 +117,9 @@ def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> N
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # for each lane the index of its sample and the number of its saved times; then the number of busy lanes
-    state, who, k = (
-        room_of_lanes(w, form),
-        w.room(2 * w.lanes + 1, "i64"),
-        w.room(form.integrated * method.needed),
-    )
+    state = room_of_lanes(w, form)
+    who = w.room(2 * w.lanes + 1, "i64")
+    k = w.room(form.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(form.all) as row:
         w.store(1.0, state, row)
@@ -257,10 +252,8 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
         every, flags, y = form.integrated, w.room(), w.room(form.integrated)
-        times, goals, states = (
-            w.load(job, TIMES, "i64"),
-            *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)),
-        )
+        times = w.load(job, TIMES, "i64")
+        goals, states = (w.load(job, word, "ptr") for word in (_GOALS, _STATES))
         with w.repeated() as leave:
             goal = lanes["goal"]
             due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)

@@ -136,22 +136,11 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, sto
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
     switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
-    of_events: dict[str, Any] = (
-        {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides}
-        if goes_on
-        else {}
-    )
-    return Form(
-        program,
-        field.with_work,
-        field.projects,
-        field.affine,
-        has_events,
-        field.pivots,
-        sampled=sampled,
-        switched=switched,
-        **of_events,
-    )
+    of_events: dict[str, Any] = {}
+    if goes_on:
+        of_events = {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides}
+    of_field = field.with_work, field.projects, field.affine, has_events, field.pivots
+    return Form(program, *of_field, sampled=sampled, switched=switched, **of_events)
 
 
 def modes_among(inputs: Inputs) -> Indices:
@@ -215,16 +204,8 @@ def start_of(setup: Setup, begun: Begun) -> Start:
         for part in (known_of(begun.args), begun.plain.known if begun.plain else ())
     )
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
-    return Start(
-        _samples(begun.args, goals, knots),
-        control_of(setup, knots),
-        goals,
-        origin,
-        (begun.y0.rows,),
-        (known,),
-        modes,
-        plain,
-    )
+    samples, control = _samples(begun.args, goals, knots), control_of(setup, knots)
+    return Start(samples, control, goals, origin, (begun.y0.rows,), (known,), modes, plain)
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
@@ -317,10 +298,8 @@ def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
         x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings)
     )
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    ys, code = (
-        jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1]),
-        code_at_end(code, h, accepted, t),
-    )
+    ys = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1])
+    code = code_at_end(code, h, accepted, t)
     most = form.transitions
     passed = NONE_PASSED
     if most:
@@ -328,18 +307,5 @@ def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
         times = jnp.where(jnp.arange(most) < number, log, jnp.inf)
         modes = jnp.reshape(more[2 * most :], (form.modes, most)) if form.modes else jnp.zeros((0, most))
         passed = Passed(times, more[:most].astype(jnp.int32), more[most : 2 * most], modes)
-    return Solved(
-        goals[:-1],
-        ys,
-        reached[:-1],
-        t,
-        Integrated.of(end, form),
-        code,
-        event,
-        accepted,
-        rejected,
-        h,
-        pivot,
-        crossings,
-        passed,
-    )
+    y_end, of_steps = Integrated.of(end, form), (accepted, rejected, h, pivot, crossings)
+    return Solved(goals[:-1], ys, reached[:-1], t, y_end, code, event, *of_steps, passed)

@@ -68,16 +68,8 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
         direction = {given[k][i]: n for k in range(len(found)) for i, n in given[k + len(found)].items()}
         rates = derivatives(graph, [n for part in found for n in part], direction)
         found += [rates[k * pushed : (k + 1) * pushed] for k in range(len(found))]
-    return Outputs(
-        graph,
-        values,
-        found[1:],
-        variables,
-        states,
-        [n for part in known for n in part.values()],
-        times,
-        slopes,
-    )
+    of_known = [n for part in known for n in part.values()]
+    return Outputs(graph, values, found[1:], variables, states, of_known, times, slopes)
 
 
 def _found(
@@ -135,15 +127,8 @@ def write_rates(w: MachineWriter, form: Form) -> None:
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(
-            w,
-            form,
-            outputs_of(form, [*form.rates, *program.guards, *form.monitored], form.y),
-            known,
-            state,
-            tau,
-            y,
-        )
+        outputs = outputs_of(form, [*form.rates, *program.guards, *form.monitored], form.y)
+        found, tangents = _found(w, form, outputs, known, state, tau, y)
         for guard in found[form.y : form.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
         for i, x in enumerate([*found[: form.y], *(x for part in tangents for x in part)]):
@@ -349,10 +334,8 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
         total = graph.add(total, graph.mul(g, x))
     for i in range(1, form.events):
         happens = graph.call("eq", which, graph.const(float(i)))
-        rate, slope = (
-            graph.call("select", happens, rate, dc[i]),
-            graph.call("select", happens, slope, slopes[i]),
-        )
+        rate = graph.call("select", happens, rate, dc[i])
+        slope = graph.call("select", happens, slope, slopes[i])
     by_dt = graph.neg(graph.div(graph.mul(total, rate), slope))
     times = [t, *(inputs[i] for i in form.sampled)]
     found = cotangents(graph, [by_dt], [graph.one], [*_varying(form, own, asked), *times])

@@ -220,11 +220,9 @@ def stages(
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()
-    A, c, no = (
-        w.table(np.array([*method.A[1:n, :n], method.b[:n]])),
-        w.table(method.c[:n]),
-        w.literal(0, w.truth),
-    )
+    A = w.table(np.array([*method.A[1:n, :n], method.b[:n]]))
+    c = w.table(method.c[:n])
+    no = w.literal(0, w.truth)
     copied(w, every, p.pointer, y1)
     w.store(math.inf, square)
 
@@ -237,14 +235,9 @@ def stages(
         if form.squares:
             by_rows = squares_of(w, form, pivots)
             near = w.at_first(i, near_rank_loss(by_rows), near)
-            w.store(
-                w.where(
-                    near,
-                    reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)),
-                    w.load(square),
-                ),
-                square,
-            )
+            sines = [left / size for left, size in by_rows]
+            least = reduce(w.smaller, sines, w.load(square))
+            w.store(w.where(near, least, w.load(square)), square)
         watched = seen(w, form, i, pivots, watched)
         each_row(
             w, every, y1, lambda row: w.fma(step, weighted(w, A[i], k, form, row), w.load(p.pointer, row))
@@ -271,10 +264,8 @@ def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> 
         for a, count in ((0, form.pivots), (form.pivots, form.turning))
     )
     first = [w.at_first(i, new, old) for new, old in zip(directions, first, strict=True)]
-    low, high = (
-        [w.smaller(a, b) for a, b in zip(low, now, strict=True)],
-        [w.larger(a, b) for a, b in zip(high, now, strict=True)],
-    )
+    low = [w.smaller(a, b) for a, b in zip(low, now, strict=True)]
+    high = [w.larger(a, b) for a, b in zip(high, now, strict=True)]
     return first, low, high, turned | turns_round(w, form, first, directions)
 
 

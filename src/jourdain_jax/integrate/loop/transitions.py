@@ -115,15 +115,8 @@ def reset_program(form: Form) -> Reset:
         times = [*times, *derivatives(graph, times, direction)]
         rates = [*rates, *derivatives(graph, rates, along | of_known)]
     of_known = [n for part in known[1:] for n in part.values()]
-    return Reset(
-        Outputs(graph, [], [], variables, states, of_known, [], slopes),
-        event,
-        work,
-        state,
-        modes_after,
-        lost,
-        times,
-    )
+    outputs = Outputs(graph, [], [], variables, states, of_known, [], slopes)
+    return Reset(outputs, event, work, state, modes_after, lost, times)
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:

@@ -56,11 +56,9 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
     """
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(12, known.random)
-    t, q, inputs = (
-        jnp.asarray(known.times[:count]),
-        jnp.asarray(known.coordinates[:count]),
-        jnp.asarray(generic_inputs(scene)),
-    )
+    t = jnp.asarray(known.times[:count])
+    q = jnp.asarray(known.coordinates[:count])
+    inputs = jnp.asarray(generic_inputs(scene))
     u = jnp.ones(len(scene.speed_names), q.dtype)
 
     def lengths(t, q):
@@ -201,11 +199,9 @@ class FullByMatrices(ByMatrices):
     def reduction_name(self) -> str:
         if self.own_equations:
             return f"none, {self.own_equations}"
-        return (
-            super().reduction_name
-            if self.cutoff is None
-            else f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
-        )
+        if self.cutoff is None:
+            return super().reduction_name
+        return f"{super().reduction_name}, cutoff {self.cutoff:.0e}"
 
     @property
     def needs_pivot(self) -> bool:

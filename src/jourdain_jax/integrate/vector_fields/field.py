@@ -322,11 +322,9 @@ class ByProgram(VectorField):
     @property
     def pivots(self) -> int:
         """Return the number of monitored pivots. With multipliers, only the coordinate rates have pivots."""
-        return (
-            self.program.divisors
-            if self.independent is None and not self.program.by_partition
-            else len(self.program.pivots)
-        )
+        if self.independent is None and not self.program.by_partition:
+            return self.program.divisors
+        return len(self.program.pivots)
 
     @property
     def needs_pivot(self) -> bool:
@@ -351,11 +349,9 @@ class ByProgram(VectorField):
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
         state = self.fixed(scene), t, q, u, inputs
-        return (
-            self.native.at_start(*state)
-            if self.native
-            else self.program.values(self.program.at_start, *state)
-        )
+        if self.native:
+            return self.native.at_start(*state)
+        return self.program.values(self.program.at_start, *state)
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
         return (self.native or self.program).energies_at(*at.of_program)
