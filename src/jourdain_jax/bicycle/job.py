@@ -100,7 +100,7 @@ class Study:
 
 
 def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Refused:
-    """Return the study of one file, or `Refused`, without an exception, if it describes no bicycle."""
+    """Return the study of one file; for a file that describes no bicycle, return `Refused`."""
     try:
         bicycle = benchmark_from_measurements(path) if holds_readings(Path(path)) else read_bicycle(path)
     except ValueError as error:

@@ -38,8 +38,8 @@ def animate(
 ) -> None:
     """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
 
-    - `frames`: maximum number of frames, taken at evenly spaced saved times. The playing time is that of the
-      motion, between 2 and 12 s.
+    - `frames`: maximum number of frames, taken at evenly spaced saved times. The animation lasts as long as
+      the motion, but at least 2 and at most 12 s.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
     - `follow`: move the view with the bodies instead of showing the whole path. `view`: elevation and azimuth
       in degrees.

@@ -117,7 +117,7 @@ def read(
 def _relaxed(
     y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho
 ) -> Float[Array, "channel"]:
-    """Return the filter's output `since` intervals after the time `begin`, at which it was `y`."""
+    """Return the output of the filter `since` intervals after the time `begin`, where it was `y`."""
     small = rho < 0.2
     quick, slow = jnp.where(small, rho, 0.1), jnp.where(small, 1.0, rho)
     # P = p - rho p' + rho^2 p'' - ...

@@ -87,7 +87,7 @@ class Drive(Response):
     hold: bool = static()
 
     def signal(self) -> Sampled:
-        """Return the scene's input."""
+        """Return the input of the scene: the command after delay, filter, gain and bias."""
         ts, values = jnp.asarray(self.command.ts), jnp.asarray(self.command.values)
         if self.has_filter:
             values = filtered(ts, values, self.numbers["lag"], self.hold)

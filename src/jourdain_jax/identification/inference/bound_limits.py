@@ -86,8 +86,8 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
 def moved_from_bounds(
     told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]
 ) -> list[str]:
-    """Return a sentence on each unknown of the first member that leaves its interval (`reach`) when an
-    unknown at a bound moves to its limit.
+    """Return one sentence for each unknown at a bound whose move to its limit takes other unknowns of the
+    first member out of their intervals (`reach`).
     """
     sentences = []
     for (_, place), there in told.at_limit.items():

@@ -205,7 +205,7 @@ class LogDensity(eqx.Module):
         return self.centre + z @ self.factor.T
 
     def _each(self, of: Callable, x: Points) -> Points:
-        """Return the results of the method called `of` of the range of each unknown, for these numbers."""
+        """Apply the method `of` of the range of each unknown to its number in `x`."""
         return jnp.stack([of(one, x[..., i]) for i, one in enumerate(self.ranges)], axis=-1)
 
     def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:

@@ -26,7 +26,7 @@ from jourdain_jax.identification.solve.arrow import Arrow, ByUnknown
 from jourdain_jax.identification.solve.levenberg_marquardt import LEAST, Minimum
 from jourdain_jax.identification.solve.problem import Problem
 
-RISE_95 = 3.841458820694124  # of 2 F
+RISE_95 = 3.841458820694124  # of 2 F: 95 % quantile of chi-square
 
 
 @dataclass(frozen=True)

@@ -215,8 +215,8 @@ def with_prior(
 def eliminated(
     local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that express the unknowns of each piece by shared unknowns and those of the previous
-    piece, and the remaining rows, without unknowns of pieces.
+    """Return rows that express the unknowns of each piece by shared unknowns and the unknowns of the previous
+    piece; and the remaining rows, which have only shared unknowns.
 
     `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
     """

@@ -36,7 +36,7 @@ _OTHERWISE = (
 
 @dataclass(frozen=True)
 class PossibleInertia:
-    """Marker returned by `possible_inertia`."""
+    """Marker for a body with free inertia, returned by `possible_inertia`."""
 
 
 def possible_inertia() -> PossibleInertia:
@@ -45,8 +45,8 @@ def possible_inertia() -> PossibleInertia:
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-    Instead of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments
-    D (kg m^2) and shears l as unknowns, `"rear frame second moment[0]"` and `"rear frame shear[0]"`.
+    I: moments and products of inertia (kg m^2, about the mass centre). Unknowns of the fit are second moments
+    D (kg m^2) and shears l instead, `"rear frame second moment[0]"` and `"rear frame shear[0]"`.
     Principal moments of inertia are then positive, and each is at most the sum of the other two. `Fit.tied`
     has moments and products with standard errors and intervals to first order, except for a flat body, with D
     at its bound. Two axes that share one parameter, as for a wheel, share one D.

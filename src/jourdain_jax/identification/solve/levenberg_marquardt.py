@@ -200,8 +200,8 @@ def fallen(
 
 
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
-    """Return D, the lengths of the columns of J. For a zero column it is the size of the unknown, times the
-    largest length.
+    """Return D, the lengths of the columns of J. For an unknown with almost no effect, length times size is
+    1e-8 of the largest one.
     """
     norms = arrow.column_norms
     by_size = norms * size

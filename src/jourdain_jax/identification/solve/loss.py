@@ -43,7 +43,7 @@ class Loss:
         )
 
     def weight(self, r: Samples) -> Samples:
-        """Return w(r)."""
+        """Return the weight w = rho'(r) / r."""
         k = self.parameter
         if self.kind == "student-t":
             return (k + 1) / (k + r**2)
@@ -69,7 +69,7 @@ class Loss:
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
 
     def _slope(self, r: Residuals) -> Residuals:
-        """Return psi'."""
+        """Return psi', the second derivative of rho."""
         k = self.parameter
         if self.kind == "student-t":
             return (k + 1) * (k - r**2) / (k + r**2) ** 2

@@ -249,8 +249,8 @@ class Piecewise(Problem):
         return max(where.stop for where in self.group_of[run].channels.values()), self.own + self.shared + 2
 
     def change(self, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
-        """Return the size of the change of all residuals, |J d + g| in units of sigma, by a step d that also
-        closes the gaps.
+        """Return |J d + g|, the change of all residuals in units of sigma by a step d that also closes the
+        gaps.
         """
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
