@@ -128,7 +128,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Return speeds (m/s) by label: below, inside and above the stable range, else fixed ones."""
+    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds without one."""
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
     if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on

@@ -73,8 +73,8 @@ class StabilitySpeeds(eqx.Module):
 
 
 def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
-    """Return upright straight running at `speed` (m/s), a steady motion, or with a kick in `lean_rate`
-    (rad/s). Both satisfy the constraints exactly.
+    """Return the state of upright straight running at `speed` (m/s). It is a steady motion, unless
+    `lean_rate` (rad/s) adds a kick. The state satisfies the constraints exactly.
     """
     q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
     return state_of(bicycle, 0.0, q, u)

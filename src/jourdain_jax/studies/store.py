@@ -343,7 +343,7 @@ class Store:
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
-        """Return the indices of intact chunks, and of damaged ones; receipts of the latter are removed."""
+        """Remove the receipts of damaged chunks, and return the indices of intact and of damaged chunks."""
         receipts = self.receipts()
         whole = [number for number in receipts if self.is_whole(number)]
         torn = sorted(set(receipts) - set(whole))

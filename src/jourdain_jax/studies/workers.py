@@ -58,8 +58,8 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
 
 def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
-    """Return the counts of a chunk after computing and storing it; one at a time in this process. Chunks that
-    a process stored before it died are not computed again.
+    """Compute and store a chunk, one at a time in this process, and return its counts. Chunks that a process
+    stored before it died are not computed again.
     """
     with _one_at_a_time:
         which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns

@@ -47,8 +47,8 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
-    """Return the channels whose value is None, and is therefore estimated. Raises ValueError for a channel
-    whose value is None in one run and given in another.
+    """Return the channels with None in place of a value, which is estimated. Raises ValueError for a channel
+    with None in one run and a value in another.
     """
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:

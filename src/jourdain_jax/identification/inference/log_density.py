@@ -130,7 +130,7 @@ class LogDensity(eqx.Module):
         """Return z for these values of unknowns by name, in their units. Omitted unknowns are at their first
         guess.
 
-        Raises ValueError for names that are not unknown, and for values at or beyond a bound.
+        Raises ValueError for names that are not in `labels`, and for values at or beyond a bound.
         """
         check_names(values, self.labels, "`{}` is not among the unknowns")
         theta = jnp.stack(
@@ -153,8 +153,8 @@ class LogDensity(eqx.Module):
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
     def whitened(self, fit: Fit) -> "LogDensity":
-        """Return the density in transformed unknowns z, independent with unit variance according to a fit of
-        the same data, so that samplers need few steps.
+        """Return the density of numbers z that are independent with unit variance, according to a fit of the
+        same data. Samplers then need few steps.
 
         `constrain` and `named` convert back to the unknowns. At the minimum of the fit z is zero. Raises
         ValueError for a fit of other unknowns, for a batch, and for unknowns without a standard error

@@ -64,7 +64,7 @@ class PlannedInformation(Printed, eqx.Module):
         """Return `log det F`, which a plan should maximise. With `names`, return it for these unknowns only,
         with all others estimated as well.
 
-        Raises KeyError for names that are not unknown.
+        Raises KeyError for names that are not in `labels`.
         """
         asked = as_names(names) or self.labels
         check_names(asked, self.labels, "`{}` is not among the unknowns", UnknownNameError)

@@ -114,7 +114,7 @@ class Estimates(Printed):
         return vars(self) | {"statistics": self.statistics, "work_out": None}
 
     def __getattr__(self, name: str) -> Any:
-        """Return an entry of `statistics`, such as `standard_errors`, of the arguments of the fit, or of the
+        """Return an entry of `statistics` (such as `standard_errors`), of the arguments of the fit, or of the
         unknowns.
         """
         parts = {

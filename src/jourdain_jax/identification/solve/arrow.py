@@ -252,8 +252,8 @@ def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.nd
 def by_singular_values(
     shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float
 ) -> Float[np.ndarray, "members shared"]:
-    """Return the damped step of the shared unknowns times D: (S^2 + lambda) ds = - S U' c, zero in
-    undetermined directions.
+    """Return the damped step ds of the shared unknowns: (S^2 + lambda) V' D ds = - S U' c, zero in
+    undetermined directions. U S V': the columns of `shared` over D; c: its residuals.
     """
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest
