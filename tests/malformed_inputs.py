@@ -256,7 +256,7 @@ NAMES: dict[str, Case] = {
     "jj.coordinates('x y', 'x')": "coordinate name `x` is used twice; every coordinate needs its own name",
     "jj.coordinates('1x')": "coordinate name `1x` is not an identifier; use letters, digits and underscores",
     "jj.coordinates('for')": "coordinate name `for` is a keyword of Python, so `q.for` cannot be written",
-    "jj.coordinates('array')": "coordinate name `array` is reserved for an attribute of the container",
+    "jj.coordinates('array')": "coordinate name `array` is reserved: `q.array` has a meaning",
     "jj.coordinates(jj.quaternion('a b'))": "coordinate name `a b_w` is not an identifier",
     "jj.quaternion(3)": (
         "the name of a quaternion is an int, expected a text, such as jj.quaternion('attitude')"
@@ -983,7 +983,7 @@ ANSWERS: dict[str, Case] = {
         "direction of gravity has shape (2,), expected (3,)"
     ),
     "answered(potential=lambda self, pose: pose.q.array)": (
-        "what `potential` of `Described` returned has shape (2,), expected one number"
+        "the result of `potential` of `Described` has shape (2,), expected one number"
     ),
     "answered(bodies=lambda self, t, q: [jj.Particle(1.0, (0.0, 0.0, 0.0))])": (
         "`bodies` of `Described` returned a list, expected a dictionary by name"
@@ -1019,11 +1019,11 @@ ANSWERS: dict[str, Case] = {
         "contact `rim` of `Described` is a float, expected a `jj.disc_contact"
     ),
     "answered(coordinate_rates=lambda self, t, q, u: jnp.ones(3))": (
-        "what `coordinate_rates` of `Described` returned has shape (3,), expected (2,); return one rate for"
+        "the result of `coordinate_rates` of `Described` has shape (3,), expected (2,); return one rate for"
         " each of x, y"
     ),
     "answered(coordinate_rates=lambda self, t, q, u: None)": (
-        "what `coordinate_rates` of `Described` returned is `None`, expected real numbers"
+        "the result of `coordinate_rates` of `Described` is `None`, expected real numbers"
     ),
     "jj.simulate(described(events=lambda self, m: {'out': 1.0 - m.q.array}), {}, t1=0.1)": (
         "event `out` of `Described` has shape (2,), expected one number; return a number, positive while"

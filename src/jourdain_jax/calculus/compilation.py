@@ -36,17 +36,15 @@ def with_usual_promotion(function: F) -> F:
 _EMITTERS: dict[str, Any] = (
     {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 )
-
-
 RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 
 
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
     """Compile like `equinox.filter_jit`; compiled programs live as long as the returned function.
 
-    `options`: XLA options for CPUs, or a function that returns them, called once per structure of arguments
-    with a placeholder for each array. They are ignored inside another transformation, because JAX accepts
-    options only for whole programs.
+    `options`: XLA options for CPUs, or a function that returns them. The function is called once per
+    structure of arguments, with a placeholder for each array. Inside another transformation options are
+    ignored, because JAX accepts them only for whole programs.
     """
 
     @lru_cache(maxsize=1024)  # structures of arguments without arrays
@@ -95,7 +93,7 @@ def _whole(arrays, treedef, rest):
 
 
 def nan_is_a_mark():
-    """Return a context in which `jax_debug_nans` is off, for NaN that marks failures."""
+    """Return a context in which `jax_debug_nans` is off, since NaN marks failures there."""
     return jax.debug_nans(False)
 
 

@@ -4,8 +4,6 @@ SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which only "
     "machine code supports; with XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
 )
-
-
 THIRD_ORDER_MESSAGE = (
     "`simulate` was differentiated three times, not in forward mode alone; pass backend='xla' and use "
     "forward mode, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
@@ -13,15 +11,15 @@ THIRD_ORDER_MESSAGE = (
 
 
 class DifferentiationModeError(TypeError):
-    """A motion has no derivative of the requested mode and order; the text names a supported one.
+    """Raised if a motion has no derivative of the requested mode and order; the text names a supported one.
 
-    Raised where the derivative is taken, evaluated or compiled, and by functions that need concrete numbers,
-    such as `fit`, inside `jit`, `vmap` or a derivative.
+    The error comes where the derivative is taken, evaluated or compiled. Functions that need concrete
+    numbers, such as `fit`, raise it inside `jit`, `vmap` or a derivative.
     """
 
 
 class OtherDeviceError(RuntimeError):
-    """Raised if machine code would become part of a program for another process or for an unsupported device."""
+    """Raised if machine code would become part of a program for another process or device."""
 
     def __init__(self, program: str) -> None:
         super().__init__(

@@ -1,8 +1,8 @@
 """Functions whose values and derivatives come from separate computations: an equivalent function or explicit
 rules.
 
-Two functions that JAX differentiates forward, the derivative of `f(x)` along tangents and the one along
-cotangents, give first and second derivatives in both modes (`linear_maps.py`).
+JAX differentiates two functions forward: `f'(x) w` of tangents w and `g f'(x)` of cotangents g. They give
+first and second derivatives in both modes (`linear_maps.py`).
 
 A function and its rule must agree on which results have a batch axis and where, because JAX assumes the
 layout of whichever is batched first.
@@ -24,14 +24,12 @@ from jourdain_jax.calculus.markers import lanes_first
 
 
 class Rules(NamedTuple):
-    """Derivative rules of a function. Trees of tangents and cotangents have None for zeros. A rule that does
-    not apply raises an error with the reason.
+    """Derivative rules of a function, which JAX differentiates forward. Trees of tangents and cotangents have
+    None for zeros. A rule that does not apply raises an error with the reason.
     """
 
-    push: Callable  # (arguments, tangents) -> result and its tangents; JAX differentiates it forward
-    # (perturbed, arguments, result, cotangents) -> cotangents of the arguments that vary; JAX differentiates
-    # it forward
-    pull: Callable
+    push: Callable  # (arguments, tangents) -> result and its tangents
+    pull: Callable  # (perturbed, arguments, result, cotangents) -> cotangents of the perturbed arguments
     # (*perturbed) -> why JAX cannot differentiate `pull`; empty if it can
     reason_against_second: Callable[..., str] = lambda *_: ""
 
@@ -151,9 +149,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
             return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
 
         def pulled(moving: list[int]) -> Callable:
-            """Return cotangents of the moving leaves as a function of leaves, result and cotangents of its
-            numbers.
-            """
+            """Return the function `BothWays.pulled` for these moving leaves."""
             varies = perturbed(moving)
 
             def cotangents(leaves, ends, given):

@@ -1,10 +1,10 @@
 """Reading of foreign files with limits on size, nesting and numbers, and atomic writing of this package's
 files.
 
-Any fault in a foreign file raises a ValueError that names the path and, if known, the line or element.
+Any fault in a foreign file raises a ValueError with the path and, if known, the line or element.
 
 Files are written under a temporary name and renamed in one step, so a killed process never leaves a partial
-file. After a power failure files may be incomplete unless `write_whole` waits for the disk.
+file. After a power failure a file may be incomplete, unless `write_whole` has waited for the disk.
 """
 
 import contextlib
@@ -152,7 +152,7 @@ _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes a line feed a
 
 
 def check_place(path: FilePath) -> None:
-    """Raise ValueError if no file can be written at `path`: its folder is missing, or it is a folder itself."""
+    """Raise ValueError if no file can be written at `path`: its folder is missing, or it is a folder."""
     place = name_of(path)
     folder = os.path.dirname(place) or "."
     try:

@@ -36,8 +36,8 @@ def evaluated(
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """Return `closed` reduced to the equations that its `outputs` need, also inside calls (`outputs`:
-    indices; default: all).
+    """Return `closed` with only the equations that some outputs need, also inside calls. `outputs`: their
+    indices (default: all).
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
@@ -47,7 +47,7 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
-    """Return the function called by a primitive that only calls a function; None for other primitives."""
+    """Return the function that a primitive calls; None for a primitive that does anything else."""
     if name not in _CALLS:
         return None
     found = params[_CALLS[name]]

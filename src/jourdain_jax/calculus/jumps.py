@@ -1,5 +1,6 @@
-"""Jumps of functions along a line. Intervals with differing end values are bisected until the difference
-either vanishes or proves to be a jump.
+"""Jumps of functions along a line, by bisection towards the half with the larger difference of values.
+
+The difference vanishes for a continuous function and stays for a jump.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,10 +15,10 @@ def jumps(
     a: Float[np.ndarray, "intervals variables"],
     b: Float[np.ndarray, "intervals variables"],
 ) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
-    """Yield, for every interval from `a` to `b` with a jump, the entry that jumps most and the points just
-    before and after.
+    """Yield the jumps between `a` and `b`, at most one per interval: the index of the entry that jumps most,
+    and the points just before and after.
 
-    `values`: maps points (points, variables) to (points, entries).
+    `values`: function from points (points, variables) to values (points, entries).
     """
     least, floor = (1e-2, 1e-3) if jnp.result_type(float) == jnp.float32 else (1e-6, 1e-9)
     at_a, at_b = values(a), values(b)

@@ -1,10 +1,10 @@
-"""Modules imported on first use, so that a first motion does not pay for what it does not need.
+"""Modules imported on first use, so that a first motion imports only what it needs.
 
-    diffrax = module_on_first_use("diffrax")      stands for the module, under `if TYPE_CHECKING: import diffrax`
+    diffrax = module_on_first_use("diffrax")      with `if TYPE_CHECKING: import diffrax` for type checkers
 
-A class that derives from one of such a module is defined in a module that is itself imported on first use.
+A subclass of a class of such a module belongs in a module that is itself imported on first use.
 `isinstance(x, diffrax.AbstractSolver)` imports diffrax, so compare `x` first with None and with our own
-kinds.
+classes.
 """
 
 from importlib import import_module
@@ -29,8 +29,8 @@ def module_on_first_use(name: str) -> Any:
 
 
 def needed(module: str, purpose: str, extra: str = "") -> Any:
-    """Import an optional package or `module`; if it is missing, raise an ImportError with its purpose and the
-    command that installs it.
+    """Import an optional package or `module`. If it is missing, raise an ImportError with the purpose and the
+    command for installation.
 
     `extra`: the extra of this package that contains it.
     """

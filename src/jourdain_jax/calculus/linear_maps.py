@@ -31,11 +31,11 @@ from jourdain_jax.calculus.markers import lanes_of, with_lanes_first
 class LinearMap:
     """Linear map between arrays that depends on other arrays, `at`."""
 
-    apply: Callable[[Sequence, Sequence], list]  # (at, arrays)
-    shapes: Sequence[jax.ShapeDtypeStruct]  # shapes of its values
-    # at the same point; None: raises an error, as beyond second order
+    apply: Callable[[Sequence, Sequence], list]  # (at, arrays) -> values
+    shapes: Sequence[jax.ShapeDtypeStruct]  # of the values
+    # the transpose at the same point; None: it does not exist, as beyond second order
     transposed: Callable[[], "LinearMap"] | None = None
-    # (indices of `at` that change) -> derivative, which also depends on the arrays; None: use JAX's
+    # (indices) -> derivative with respect to these arrays of `at`; its point is (*at, *arrays); None: by JAX
     along: Callable[[list[int]], Optional["LinearMap"]] = lambda _: None
 
     def __call__(self, at: Sequence, arrays: Sequence) -> list:
@@ -75,7 +75,7 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """Return the map for a batch. `axes`: batch axis of each array of `at`; tangents have it first."""
+    """Return the map for a batch. `axes`: batch axis of each array of `at`; mapped arrays have it first."""
     transposed = own.transposed
 
     def along(which: list[int]) -> LinearMap | None:
@@ -93,8 +93,9 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
 
 
 def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
-    """Return a second derivative with batch axes at the given places (None: shared by all samples), from one
-    with the batch axis first.
+    """Return a second derivative whose arrays have the given batch axes (None: shared by all samples).
+
+    `own`: the same derivative of arrays with the batch axis first.
     """
     transposed = own.transposed
 
@@ -184,21 +185,21 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """Linear map for both modes of differentiation. Its argument has the form of `leaves`, its value the form
-    of `found`, with real numbers at the `places`.
+    """Derivative of a function in both modes. Only the leaves with given indices move; the others are fixed.
+
+    `rates` and `pulled` take these indices and return a function:
+
+        rates     (leaves, *tangents of the moving leaves) -> tangents of the real results
+        pulled    (leaves, results, cotangents of the real results) -> cotangents of the moving leaves
     """
 
-    # indices of moving leaves -> function of the leaves and their tangents that returns tangents of the
-    # numbers
     rates: Callable[[list[int]], Callable]
-    # indices of moving leaves -> function of leaves, results and cotangents of the numbers that returns
-    # cotangents of the leaves
     pulled: Callable[[list[int]], Callable]
     # indices of moving leaves -> why JAX cannot differentiate `pulled`; empty if it can
     reason_against_second: Callable[[list[int]], str]
-    leaves: Sequence[jax.ShapeDtypeStruct]
-    found: Sequence[jax.ShapeDtypeStruct]
-    places: list[int]
+    leaves: Sequence[jax.ShapeDtypeStruct]  # of the arguments
+    found: Sequence[jax.ShapeDtypeStruct]  # of the results
+    places: list[int]  # of the real numbers among the results
 
     def pushes(self, moving: list[int]) -> LinearMap:
         """Return the map of tangents of the leaves, at the leaves and the result."""

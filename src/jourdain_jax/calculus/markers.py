@@ -4,18 +4,18 @@
 `tap_cotangents` pass derivatives to a Python function; they act only outside `jit`, so no compiled program
 calls Python.
 
-Between `entered` and `left`, derivatives are NaN where a computation failed, and zero where the failed result
-is not used. Plain `jnp.where(failed, nan, x)` would fail on both: its derivative is zero where it is NaN, as
-if at a minimum, and omitted values contribute derivatives such as 0 NaN.
-
-For a computation y(x) in between, with a zero that counts the incoming derivatives,
+For a computation y(x) between `entered` and `left`, with some samples that failed,
 
     forward     dy = NaN where y failed and any dx is not zero
-    reverse     dx = 0 where no dy is requested, NaN where the dy of a failed y is
+    reverse     dx = 0 where every dy is zero, NaN where the dy of a failed y is not      (dx, dy: cotangents)
 
-Both are linear maps whose derivatives are maps of the same kind. In their reverse mode, cotangents reach x
-without passing `left`, through the point at which the first derivative was taken. That zero therefore counts
-as such a point, too.
+`jnp.where(failed, nan, x)` alone gives wrong derivatives: zero where it is NaN, as at a minimum, and 0 NaN
+from failed values that are not used.
+
+An extra number, which is zero, goes from `entered` to `left`; its derivative counts the nonzero derivatives.
+The rules are linear maps, and so are their derivatives. In reverse mode of these, cotangents reach x through
+the point of the first derivative, without passing `left`. The earlier count is therefore a part of that
+point.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,8 +33,8 @@ from jourdain_jax.calculus.reals import Flag, Scalar
 
 
 def identity(name: str) -> Primitive:
-    """Return a primitive `name` that returns several arrays unchanged, with optional parameters and batch
-    axes kept in place. It has no derivative yet.
+    """Return a primitive `name` without derivative that returns several arrays unchanged, batch axes
+    included.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -49,8 +49,8 @@ def identity(name: str) -> Primitive:
 
 
 def lanes_first(tree):
-    """Return the tree unchanged, except that under `vmap` the batch axis of every array becomes the first.
-    Values without a tangent space pass through.
+    """Return the tree; under `vmap` the batch axis of every array becomes the first. Values without a tangent
+    space pass through.
     """
     leaves, treedef = jax.tree.flatten(tree)
     moved = [i for i, x in enumerate(leaves) if x.dtype != jax.dtypes.float0]
@@ -176,7 +176,7 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
 
 @jax.custom_jvp
 def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
-    """Return these arrays and the zero to pass to `left`."""
+    """Return these arrays, and the zero for `left` that counts derivatives."""
     *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
     return each, asked
 
@@ -185,7 +185,7 @@ def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
 def left(
     asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]
 ) -> list[Array]:
-    """Return `each` of some arrays. `failed` marks failed samples along their first axes; `asked` is the zero
+    """Return the arrays `each`. `failed`: which samples failed, along their first axes; `asked`: the zero
     from `entered`.
     """
     return lanes_first([*each, *failed, asked])[: len(each)]
@@ -193,9 +193,7 @@ def left(
 
 @jnp.vectorize
 def nan_where(failed: Flag, x: Scalar) -> Scalar:
-    """Return `x`, with NaN in values and derivatives where `failed` is true. Structurally zero derivatives
-    stay zero.
-    """
+    """Return `x` with NaN in values and derivatives where `failed` is true; zero derivatives stay zero."""
     (x,), asked = entered(x)
     return left(asked, [failed], [x + jnp.where(failed, jnp.nan, 0.0)])[0]
 
@@ -226,8 +224,8 @@ def _leaving(primals, tangents):
     return left(*primals), list(map(lost, failed, each, rates))
 
 
-# The maps, with NumPy or jax.numpy as `m`. `lanes` is the number of leading batch axes; `before` is the
-# earlier count in a derivative of a derivative.
+# The maps, with NumPy or jax.numpy as `m`. `lanes`: number of leading batch axes; `before`: count of the
+# first derivative, in a derivative of it.
 
 
 def _any(m, x, lanes):
@@ -282,9 +280,7 @@ def _lost_and_counted_back(cotangents, failed, asked, x, *, lanes):
 
 
 def _map(function: Callable, back: Callable, at: int) -> Primitive:
-    """Return a map as a JAX primitive that is linear in all arrays except the first `at`; `back`: its
-    transpose.
-    """
+    """Return a map as a JAX primitive, linear in all arrays except the first `at`. `back`: its transpose."""
     p = Primitive(f"jourdain_nan{function.__name__}")
 
     def shapes(*avals, lanes):

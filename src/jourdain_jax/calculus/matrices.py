@@ -4,13 +4,13 @@ constant rank.
     dA+ = -A+ dA A+  +  A+ A+' dA' (1 - A A+)  +  (1 - A+ A) dA' A+' A+
     A Z = 0,   dZ = -A+ dA Z
 
-The first is from G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. (4.12). Differentiating the
-factorisation would divide by differences of singular values, which are zero for the orthonormal rows of
-rolling and skating.
+The formula of A+ is from G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. (4.12).
+Differentiating the factorisation would divide by differences of singular values, which are zero for the
+orthonormal rows of rolling and skating.
 
-The second omits the rotation of the basis within the null space (its gauge), which LAPACK chooses
-arbitrarily. Results that are invariant under Z -> Z R do not depend on it, but the derivative of Z itself is
-wrong: do not let a basis leave the function that uses it.
+The formula of the basis Z omits its rotation within the null space, which LAPACK chooses arbitrarily. Results
+that are invariant under rotations Z -> Z R do not depend on it. The derivative of Z itself is wrong: do not
+let a basis leave the function that uses it.
 
 For static shapes, a basis has as many columns as `A`. Columns outside the null space are zero, and `present`
 identifies the others.
@@ -30,8 +30,8 @@ from jourdain_jax.calculus.reals import Count, rank_cutoff
 def pseudo_inverse(
     A: Float[Array, "rows columns"], cutoff: float | None = None
 ) -> Float[Array, "columns rows"]:
-    """Return the Moore-Penrose inverse of `A`, dropping singular values below `cutoff` times the largest. It
-    is differentiable to any order in both modes where the rank is constant.
+    """Return the Moore-Penrose inverse of `A`, differentiable to any order in both modes where the rank is
+    constant. Singular values below `cutoff` times the largest count as zero.
     """
     if 0 in A.shape:
         return jnp.zeros(A.shape[::-1], A.dtype)

@@ -55,8 +55,8 @@ def undecided(dtype: jnp.dtype) -> float:
     """Return the relative row size below which round-off decides the branch of a motion: 8 sqrt(eps) of
     `dtype`.
 
-    Where two branches of g = 0 cross, g = e is a hyperbola that leads from one branch to the other at a
-    distance of about sqrt(e) from the crossing.
+    Round-off e turns two crossing branches of g = 0 into the hyperbola g = e. At a distance of about sqrt(e)
+    from the crossing, it leads from one branch to the other.
     """
     return 8 * float(jnp.finfo(dtype).eps) ** 0.5
 
@@ -89,20 +89,11 @@ def _of_jax(x) -> Array:
     if has_unit(x):
         raise TypeError(f"real numbers are expected, but this is {described(x)}")
     try:
-        x = (
-            np.asarray(x, real_type())
-            if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble
-            else x
-        )
+        if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble:
+            x = np.asarray(x, real_type())
         # without a dtype, JAX compiles a program for each shape of a NumPy array
-        return jnp.asarray(
-            x,
-            (
-                jax.dtypes.canonicalize_dtype(x.dtype)
-                if isinstance(x, np.ndarray) and x.dtype.kind == "f"
-                else None
-            ),
-        )
+        is_float = isinstance(x, np.ndarray) and x.dtype.kind == "f"
+        return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if is_float else None)
     except OverflowError:
         raise ValueError("an integer is too large for a floating-point number; use a smaller one") from None
 
@@ -169,12 +160,8 @@ def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advic
 
 def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
     """Return an integer from `low` to `high`, or raise ValueError with the `expected` range."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | np.integer)
-        or value < low
-        or (high is not None and value > high)
-    ):
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < low or (high is not None and value > high):
         raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
     return int(value)
 
@@ -185,8 +172,8 @@ def holds(condition: Callable, *numbers) -> bool:
 
 
 def has_unit(x) -> bool:
-    """Return whether `x` is a quantity with a unit, or a list that contains one. Conversion to a number would
-    drop the unit, so 1,300 g would become 1,300 kg.
+    """Return whether `x` is a quantity with a unit, or a list that contains one. As a number it would lose
+    the unit, so 1,300 g would become 1,300 kg.
     """
     if isinstance(x, list | tuple):
         return any(has_unit(part) for part in x if type(part) is not float)
@@ -202,20 +189,13 @@ def as_array(x, dtype):
 
 def in_default_precision(tree):
     """Return the tree with floating-point arrays converted to the default type."""
-    return jax.tree.map(
-        lambda x: (
-            x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x
-        ),
-        tree,
-    )
+    is_real = lambda x: is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating)
+    return jax.tree.map(lambda x: x.astype(real_type()) if is_real(x) else x, tree)
 
 
 def _check(array, what: str, shape: Shape | None, advice: str) -> None:
-    if (
-        array.dtype.kind not in "iuf"
-        and not jnp.issubdtype(array.dtype, jnp.integer)
-        and not jnp.issubdtype(array.dtype, jnp.floating)
-    ):
+    real = jnp.issubdtype(array.dtype, jnp.integer) or jnp.issubdtype(array.dtype, jnp.floating)
+    if array.dtype.kind not in "iuf" and not real:
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")
     if shape is not None and array.shape != shape:
         expected = "one number" if shape == () else str(shape)
@@ -267,7 +247,7 @@ def is_traced(*trees) -> bool:
 
 
 def known_numbers(x) -> np.ndarray:
-    """Return concrete numbers for a check, or an empty array if they are traced, so that the check passes."""
+    """Return concrete numbers for a check; an empty array, which passes every check, if they are traced."""
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 

@@ -1,22 +1,22 @@
 """Roots of residuals: Newton's method, damped least squares, fixed-point iteration, and Gauss-Newton in NumPy
 at many states at once.
 
-    F(x, theta) = 0   =>   dx = - (dF/dx)^-1 (dF/dtheta) dtheta                                             `newton_root`
-    min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx                                          `damped_search`
-    x <- step(a, x):   D <- d step/da + d step/dx D,   D = dx/d(a, x_0)                                      `fixed_point`
-    x <- x - G+ g(x),   G = dg/dx                                                                           `nearest_root`
+    newton_root      F(x, theta) = 0   =>   dx = - (dF/dx)^-1 (dF/dtheta) dtheta
+    damped_search    min |f(x)|^2:     x <- x - J' (J J' + damping)^-1 f,         J = df/dx
+    fixed_point      x <- step(a, x):  D <- d step/da + d step/dx D,              D = dx/d(a, x_0)
+    nearest_root     g(x) = 0:         x <- x - G+ g(x),                          G = dg/dx
 
 `newton_root` is differentiated by `jax.lax.custom_root`, which linearises F once, at the root. Derivatives of
-any order, in either mode, cost one linear solve each. `damped_search` has no derivative: differentiate at the
-root. Under `vmap` it runs until the last sample has converged (J. Nocedal and S. Wright, Numerical
-Optimization (2006), section 10.3).
+any order, in either mode, cost one linear solve each. `damped_search` (J. Nocedal and S. Wright, Numerical
+Optimization (2006), section 10.3) has no derivative: differentiate at the root. Under `vmap` it runs until
+the last sample has converged.
 
-`fixed_point` carries the derivative along with x for the entries of a and x_0 that vary, so both modes of
-differentiation run one loop. If the iteration converges quadratically, each further step doubles the correct
-order of derivatives; two steps without change give derivatives up to the third. Once all samples have
+`fixed_point` computes x together with D for the entries of a and x_0 that vary, so both modes of
+differentiation run one loop. If the iteration converges quadratically, each further step doubles the order
+of correct derivatives; two steps without change give derivatives up to the third. Once all samples have
 settled, the remaining steps are skipped, also under `vmap`.
 
-`nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal; it
+`nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal. It
 then drops small singular values.
 """
 
@@ -49,9 +49,8 @@ class Root(eqx.Module):
 def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
     """Return x with `residual(x) = 0` near `guess`; `residual` may close over traced numbers.
 
-    `scale`: size of each unknown, relative to which round-off is judged; infinite for an unknown to ignore.
-    The iteration stops when the corrections no longer shrink. It has converged if they are then at most
-    eps^0.6.
+    `scale`: size of each unknown; infinite for an unknown to ignore. The iteration stops when the corrections
+    no longer shrink. It has converged if they are then at most eps^0.6 times the sizes.
     """
 
     eps = eps_of(guess)
@@ -118,11 +117,11 @@ class Search(eqx.Module):
 def damped_search(
     rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80
 ) -> Search:
-    """Search near `guess`, within `low` to `high`, for x with no residual above `tolerance`; otherwise return
-    the smallest residual found. J has derivatives with respect to x in units of `size`.
+    """Search from `guess`, between `low` and `high`, for x whose residuals f are at most `tolerance`. Return
+    the best x, its f, and J in units of `size`.
 
-    `rows`: x -> f and J. `size`: unit of the steps of each unknown; zero for a fixed one. Scale `rows` to be
-    of order one when unknowns change by their size.
+    `rows`: function from x to f and J = df/dx. `size`: unit of the steps of each unknown, zero for a fixed
+    one. Scale f so that a change of an unknown by its size changes f by about one.
     """
 
     def look(x):
@@ -160,11 +159,12 @@ def damped_search(
 def smooth_root(
     look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80
 ) -> Unknowns:
-    """Return the root near a guess, differentiable to any order. After a search without derivatives come
-    three steps `x <- x - J+ R(x)` with constant J, each of which makes one more order of derivatives correct.
+    """Return the root near a guess, differentiable up to the third order. After a search without derivatives
+    come three steps `x <- x - J+ R(x)` with constant J; each makes one more order of derivatives correct.
 
-    `look`: x -> R and J, without derivatives; `rows`: x -> R; `x`: values of the fixed unknowns (size zero)
-    with their derivatives; `cutoff`: of J+. Other arguments as for `damped_search`.
+    `look`: function from x to residuals R and Jacobian J, without derivatives; `rows`: function from x to R;
+    `x`: values of the fixed unknowns (size zero), with their derivatives; `cutoff`: relative cutoff of J+.
+    Other arguments as for `damped_search`.
     """
     found = jax.lax.stop_gradient(
         damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps)
@@ -178,8 +178,8 @@ def smooth_root(
 def first_root(
     rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds
 ) -> tuple[Nearest, Count]:
-    """Return the root from the first of the `guesses` that succeeds, and the index of that guess; without a
-    root, the nearest approach.
+    """Return the root from the first successful one of the `guesses`, and its index. If none succeeds, return
+    the end with the smallest residuals.
 
     A root has residuals of at most `good`. Other arguments, including the `bounds`, as for `damped_search`.
     """
@@ -219,7 +219,7 @@ def fixed_point(
 ) -> Float[Array, "entries"]:
     """Return x after at most `most` steps of `x <- step(a, x)`; a NaN counts as settled.
 
-    `prepare`: turns a into the argument of the steps, a pair whose second part is not differentiated.
+    `prepare`: function from a to the argument of the steps, a pair whose second part is not differentiated.
     """
     return _iterated((a, x), step=step, most=most, prepare=prepare)
 
@@ -263,7 +263,7 @@ def _iterated_jvp(primals, tangents, *, step, most, prepare):
 
 
 def _loop(step: Callable, carry: tuple, most: int) -> tuple:
-    """Iterate `step` at most `most` times on a tuple whose first entry decides whether it has settled."""
+    """Iterate `step` on a tuple at most `most` times, or until its first entry no longer changes."""
     if most <= QUIET:
         return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=most)[0]
 
@@ -292,11 +292,11 @@ def nearest_root(
     longest: np.ndarray | float = np.inf,
     within: tuple = (-np.inf, np.inf),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
-    1 + |x|, infinite for NaN.
+    """Return x with g(x) = 0 near the given x, (states, unknowns), and the last corrections relative to
+    1 + |x|, which are infinite for NaN.
 
-    `solve`: returns the shortest d with G d = g. No step exceeds `longest` in an entry or leaves the bounds
-    `within`.
+    `look`: function from x and state indices to g and G. `solve`: function from G and g to the shortest d
+    with G d = g. No entry of a step exceeds `longest`, and x stays within the bounds `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):
@@ -316,15 +316,15 @@ def nearest_root(
 
 
 def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return the shortest d with G d = g at every state; a least-squares solution if rows are nearly
-    dependent or shorter than `typical`.
+    """Return the shortest d with G d = g at every state. If rows are nearly dependent, or shorter than
+    `typical`, return a least-squares solution.
     """
     return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]
 
 
 def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return G+ at every state, NaN where G is NaN. Rows are first scaled to unit length, or to less if
-    shorter than `typical`.
+    """Return G+ at every state, NaN where G is NaN. Rows are first scaled to unit length; rows below
+    `typical` become shorter than that.
     """
     lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
     d = 1 / np.where(lengths > 0, lengths, 1.0)

@@ -21,8 +21,9 @@ Attitude = Float[Array, "4"]
 
 
 def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the shortest rotation from z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x
-    k, s = |v|, c = z.k. For k = -z, return half a turn about x.
+    """Return the shortest rotation from the z axis to a direction k, half a turn about x for k = -z.
+
+    R = 1 + [v]x + (1 - c)/s^2 [v]x [v]x      v = z x k,  s = |v|,  c = z.k
     """
     k = direction / np.linalg.norm(direction)
     v = np.cross([0.0, 0.0, 1.0], k)
@@ -111,8 +112,8 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
 def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Float[np.ndarray, "matrices 4"]:
     """Return unit quaternions (w, x, y, z), with either sign, of concrete rotation matrices, body to space.
 
-    The largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2 follows from the diagonal, the others after division by its root
-    (Shepperd 1978).
+    The diagonal gives the largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2. The other components are sums and
+    differences of entries, divided by its root (Shepperd 1978).
     """
     R = np.asarray(rotations, float)
     trace = np.trace(R, axis1=1, axis2=2)

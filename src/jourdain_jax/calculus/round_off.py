@@ -1,7 +1,9 @@
 """Scalar functions with bounds of their round-off (Higham, 2002, 3.3). Values and bounds share one array,
-values first.
+values first. With e_a, e_b the bounds of a and b,
 
-    a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
+    a + b    e_a + e_b + eps |a + b|
+    a b      |a| e_b + |b| e_a + e_a e_b + eps |a b|
+    a/b      (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
 
 The bound is infinite if a divisor or radicand may be zero within its own bound.
 """
@@ -59,8 +61,8 @@ def quotient(x, y):
 
 
 def root(x):
-    """Return the square root of a. Twice its derivative 1/(2 sqrt(a)) bounds the error even if a is smaller
-    than its own error.
+    """Return the square root of a. Twice its slope, 1/sqrt(a), times e_a bounds the error, even for a below
+    e_a.
     """
     a, ea = halves(x)
     value = np.sqrt(a)
@@ -70,9 +72,7 @@ def root(x):
 
 
 def wave(function: Callable) -> Callable:
-    """Return an operation that bounds errors as for sine and cosine: Lipschitz constant 1, values between -1
-    and 1.
-    """
+    """Return sine or cosine with a bound: their slopes and values lie between -1 and 1."""
 
     def bounded(x):
         a, ea = halves(x)

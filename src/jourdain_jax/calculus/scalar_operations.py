@@ -49,7 +49,7 @@ class Operation:
         return self.kind != "choice" and self.name not in COMPARISONS
 
 
-# Longer derivatives. -----------------------------------------------------------------------------
+# Longer derivatives.
 
 
 def _quotient(g, n, a, b, da, db):

@@ -1,9 +1,8 @@
-"""Sparse Jacobians of constraints at many states. With few coordinates per constraint, as in a long chain,
-the linear systems are sparse.
+"""Sparse Jacobians G of constraints at many states: each constraint has few coordinates, as in a long chain.
 
-    G G' y = f,   x = G' y
+    G x = f,   x shortest:      G G' y = f,   x = G' y
 
-Dense solution time grows with the cube of the number of rows, sparse solution time of a chain linearly.
+The time of a dense solution grows with the cube of the number of rows, of a sparse solution linearly (chain).
 """
 
 import contextlib
@@ -49,8 +48,8 @@ class Pattern:
     def shortest(
         self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """Return the shortest x with `G x = right` at every state. Where the sparse solution fails, use dense
-        matrices as `roots.shortest` does.
+        """Return the shortest x with `G x = right` at every state. Where the sparse solution fails, solve by
+        dense matrices (`roots.shortest`).
 
         `typical`: typical row lengths, which limit the scaling of short rows.
         """

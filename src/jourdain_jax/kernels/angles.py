@@ -1,11 +1,11 @@
-"""Sine, cosine, tangent and their inverses for vectors of doubles, by polynomials
-and double-double arithmetic.
+"""Sine, cosine, tangent and their inverses for vectors of doubles, by polynomials and double-double
+arithmetic.
 
-Whole quarter turns are subtracted from an angle with pi/2 in the three parts of `program/emit.py`, which
-leaves a remainder in two parts. This is exact while the multiple of pi/2 has 20 bits; larger angles are
-multiplied by the relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and
-cosine use the minimax polynomials of `program/emit.py`, arcs use Chebyshev polynomials (12 and 13 terms of
-mpmath's `chebyfit`, which a test reproduces):
+An angle loses its whole quarter turns, with pi/2 in the three parts of `program/emit.py`; a remainder in two
+parts is left. This is exact while the multiple of pi/2 has 20 bits. Larger angles are multiplied by the
+relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and cosine use the
+minimax polynomials of `program/emit.py`. Arcs use Chebyshev polynomials P of 12 and 13 terms, from mpmath's
+`chebyfit`, which a test reproduces:
 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
     asin s = s + s^3 P(s^2) for |s| < 1/2,         otherwise   asin s = pi/2 - 2 asin sqrt((1 - s)/2)
@@ -28,8 +28,8 @@ Triple = tuple[Value, Value, Value]
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """Return a polynomial by Horner's rule, highest power first. Long ones evaluate
-    even and odd powers separately.
+    """Return a polynomial by Horner's rule; coefficients of the highest powers come first. Long polynomials
+    evaluate even and odd powers separately.
     """
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
@@ -69,9 +69,7 @@ def _halves(w: Writer, a: Value) -> DoubleDouble:
 
 
 def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return q and d, where q - d is the quotient of two double-double numbers. A
-    zero quotient keeps its sign.
-    """
+    """Return q and d, where q - d is the quotient of two double-double numbers. A zero keeps its sign."""
     inverse = 1.0 / b[0]
     q = a[0] * inverse
     return q, (product_less(w, q, b[0], a[0]) + (q * b[1] - a[1])) * inverse
@@ -125,31 +123,24 @@ def tangent(w: Writer, x: Value) -> Value:
 
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
-    """Return the `quick` values, replaced in lanes with large angles by the results of `far_ones`. These are
-    separate functions, because most calls skip them.
+    """Return the `quick` values, or in lanes with large angles the results of `far_ones`: name -> function.
+    Most calls skip these functions, so they are not inlined.
     """
     far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
         w.store(value, place)
     with w.when(w.any(far)):
         for value, place, (name, function) in zip(quick, places, far_ones.items(), strict=True):
-            w.store(
-                w.where(
-                    far,
-                    w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x),
-                    value,
-                ),
-                place,
-            )
+            found = w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x)
+            w.store(w.where(far, found, value), place)
     return [w.load(place) for place in places]
 
 
 def _sine_and_cosine(w: Writer, angle: Triple) -> DoubleDouble:
     (r, less), (most, more), quadrant = _waves(w, *angle)
     sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
-    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(
-        w, w.where(odd, sine, cosine), quadrant + 1
-    )
+    across, along = w.where(odd, cosine, sine), w.where(odd, sine, cosine)
+    return _turned(w, across, quadrant), _turned(w, along, quadrant + 1)
 
 
 def _tangent(w: Writer, angle: Triple) -> Value:
@@ -170,8 +161,8 @@ _FAR_TANGENT = {"far_tangent": _tangent}
 
 
 def _reduced(w: Writer, x: Value) -> Triple:
-    """Return the remainder of an angle after whole quarter turns, its low part, and
-    the number of quarter turns.
+    """Return the remainder of an angle after whole quarter turns, its low part, and the number of quarter
+    turns.
     """
     shifted = w.fma(x, 2 / math.pi, WHOLE)
     turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
@@ -181,8 +172,8 @@ def _reduced(w: Writer, x: Value) -> Triple:
 
 
 def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDouble, DoubleDouble, Value]:
-    """Return (r, s), (m, c) and k: an angle of k quarter turns plus a remainder with sine r - s and cosine m
-    + c. A zero sine keeps its sign.
+    """Return (r, s), (m, c) and k for an angle of k quarter turns plus a remainder with sine r - s and cosine
+    m + c. A zero sine keeps its sign.
     """
     square = r * r
     half = 0.5 * square
@@ -356,8 +347,8 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> Triple:
-    """Return whether |x| is above 1/2, and an arc in two parts: asin |x| or, above
-    1/2, asin sqrt((1 - |x|)/2).
+    """Return whether |x| is above 1/2, and an arc in two parts: asin |x|, or above 1/2 asin sqrt((1 -
+    |x|)/2).
     """
     a = w.magnitude(x)
     large = a > 0.5

@@ -1,7 +1,7 @@
 """Machine code as a function of JAX: the call frame of XLA's foreign function interface, registered handlers,
 and distribution of lanes over threads.
 
-Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header shipped with
+Layouts are the ones of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header shipped with
 jaxlib states its version. Another major version, or frames with other members, are not supported.
 
 Machine code works in double precision. XLA converts arrays in single precision before and after a call,
@@ -52,8 +52,8 @@ def version() -> tuple[int, int] | None:
     found = _stated_version()
     if found is None:
         warnings.warn(
-            "this jaxlib has an unknown foreign function interface, so XLA integrates motions, more slowly; "
-            "install a supported version of jaxlib",
+            "this jaxlib has an unknown foreign function interface, so XLA integrates motions, which takes "
+            "longer; install a supported version of jaxlib",
             stacklevel=2,
         )
     return found
@@ -71,7 +71,7 @@ def reason_against() -> str:
 
 
 def devices() -> str:
-    """Return the devices of machine code for display, if there are any besides the CPU."""
+    """Return text for display on the devices of machine code; empty if the CPU is the only one."""
     return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
 
 
@@ -111,7 +111,7 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes except the last 1 or 3. For a GPU the host has computed it."""
+    """Return the product of the sizes of all axes except the last `but` (1 or 3); on a GPU, from the host."""
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
     total = w.room(type="i64")
@@ -124,9 +124,7 @@ def product(w: Writer, x: Given, but: int) -> Value:
 def write_handler(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write a handler that calls `body` with all arguments and results; for a GPU,
-    write the kernel that does so.
-    """
+    """Write a handler, or for a GPU a kernel, that calls `body` with all arguments and results."""
     if w.device:
         return _write_kernel(w, arguments, results, body)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
@@ -157,7 +155,7 @@ def answer_metadata(w: Writer, frame: Value) -> None:
 def _write_kernel(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write `kernel(words)`, which every thread of a GPU runs. The last result is scratch memory of the call."""
+    """Write `kernel(words)`, which every thread of a GPU runs. Its last result is scratch memory."""
     with w.function(
         KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"
     ):
@@ -178,8 +176,8 @@ def given(w: Writer, buffer: Value) -> Given:
 
 
 def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:
-    """Return the results of a `call` of machine code in a JAX program, with arrays in single precision
-    converted; `more`: avals of further results, which are dropped.
+    """Return the results of a `call` of machine code in a JAX program. Arrays in single precision are
+    converted. `more`: abstract values of further results, which are dropped.
     """
 
     def converted(x, old, new):
@@ -205,7 +203,7 @@ def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callabl
 
 
 def registered(text: str, effort: int = 2) -> str:
-    """Register the handler of a module of LLVM IR and return its name; `effort`: as for `host.object_code`."""
+    """Register the handler of a module of LLVM IR and return its name; `effort`: of `host.object_code`."""
     name = _name(text, effort)
     register(name, text, "cpu", effort)
     return name
@@ -254,12 +252,8 @@ def lanes_taken(w: Writer, job: Value, word: int) -> Value:
 def share(w: Writer, job: Value, count: Value) -> None:
     """Call the module's `loop(job)` in up to `w.threads` threads, fewer for small batches."""
     threads = w.threads
-    loop, nothing, others, started = (
-        Value(w, "ptr", "@loop"),
-        w.null,
-        w.room(threads, "i64"),
-        w.room(type="i64"),
-    )
+    loop, nothing = Value(w, "ptr", "@loop"), w.null
+    others, started = w.room(threads, "i64"), w.room(type="i64")
     w.store(w.literal(0, "i64"), started)
     how = w.room(16, "i64")  # a `pthread_attr_t`, which takes up to 64 bytes
     if threads > 1:
@@ -294,16 +288,12 @@ class OfLane(NamedTuple):
 
 
 def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
-    """Return the numbers of one of `count` lanes in an array; on a CPU they are contiguous.
-
-    On a GPU lanes come last, so that neighbouring threads, which begin and save
-    together, access neighbouring words.
+    """Return the numbers of one of `count` lanes in an array. On a CPU they are contiguous; on a GPU lanes
+    come last, because neighbouring threads begin and save together and then access neighbouring words.
     """
-    return (
-        OfLane(w.at(array, lane, "double"), count)
-        if w.device
-        else OfLane(w.at(array, lane * numbers, "double"), 1)
-    )
+    if w.device:
+        return OfLane(w.at(array, lane, "double"), count)
+    return OfLane(w.at(array, lane * numbers, "double"), 1)
 
 
 def taken_in(w: Writer, count: int, numbers: OfLane, rows: Value, lane: Value) -> None:
@@ -332,13 +322,8 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
             with w.each_lane() as lane:
                 number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
-                taken_in(
-                    w,
-                    given,
-                    of_lane(w, rows, count, given, w.where(number < count, number, count - 1)),
-                    state,
-                    lane,
-                )
+                known = w.where(number < count, number, count - 1)
+                taken_in(w, given, of_lane(w, rows, count, given, known), state, lane)
             w.run("row", state, found)
             with w.each_lane() as lane:
                 number = w.load(who, lane, "i64")

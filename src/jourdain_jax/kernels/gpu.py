@@ -1,10 +1,11 @@
-"""Kernels of NVIDIA GPUs as functions of JAX. A handler on the host, compiled for the CPU, launches
-each kernel on XLA's stream.
+"""Kernels of NVIDIA GPUs as functions of JAX. A handler on the host, compiled for the CPU, launches each
+kernel on XLA's stream.
 
-One handler serves all kernels. A call identifies its kernel by a number, which a table of this process maps
-to the loaded kernel. For each array the kernel receives its address, the size of the last axis, and the
-products of the sizes of all axes but the last one and but the last three. The last result is scratch memory
-of the call: a lane counter, and memory that threads need beyond their own. Layouts are as in `ffi.py`.
+One handler serves all kernels. A call has the number of its kernel, and a table of this process maps the
+number to the loaded kernel. The kernel receives four words for each array: its address, the size of the last
+axis, and two products of sizes, of all axes but the last one and of all but the last three. The last result
+is scratch memory of the call: a lane counter, and memory that threads need beyond their own. Layouts are as
+in `ffi.py`.
 """
 
 import ctypes
@@ -28,7 +29,7 @@ MOST_KERNELS = 4096  # per process
 _NUMBER, _FUNCTION, _WORDS = range(3)  # word indices of a table entry, and number of words
 _BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
 
-# the last entry is empty: a program that names a kernel unknown to this process finds it
+# the last entry is empty; a program with the number of a kernel unknown to this process finds this entry
 _table = (ctypes.c_uint64 * (_WORDS * (MOST_KERNELS + 1)))()
 _loading = threading.RLock()
 _kernels: dict[int, nvidia.Loaded] = {}
@@ -162,8 +163,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the order of an array's axes in memory, the fastest first. Its first `lanes`
-    axes are faster than all others.
+    """Return the order of an array's axes in memory, the fastest first. The first `lanes` axes are faster
+    than all others.
     """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 
@@ -171,8 +172,8 @@ def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
 def lowered(
     ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel, batch: tuple[int, ...], samples: int
 ) -> list:
-    """Return the call of a kernel for a batch. Batch axes come last in memory, except in
-    samples, the first argument.
+    """Return the call of a kernel for a batch. Batch axes come last in memory, except in the first `samples`
+    arguments.
     """
     lanes = math.prod(batch)
     slot, allowed = kernel.scratch

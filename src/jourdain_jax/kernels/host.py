@@ -5,8 +5,8 @@ user's cache folder. A file is named after the source of its code. It begins wit
 tools and the code, so that incomplete, modified or exchanged files are compiled again.
 
 Cached code runs in this process, so folders and files that another user owns or may write are not used. The
-digest is no protection against someone who can write as the user, nor does LLVM check loaded code. Such a
-person could equally modify imported Python files.
+digest does not protect against someone who can write as the user; such a person could equally modify imported
+Python files.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ except (ImportError, OSError) as error:
     _NOT_IMPORTED = f"llvmlite cannot be imported ({error})"
 
 _LANES = (("avx512f", 8), ("avx", 4))  # doubles per register; otherwise 2, as on every 64-bit machine
-# Maximum optimisation level. It does not affect results, because LLVM is never allowed to round differently.
+# Maximum optimisation level. It does not affect results, because LLVM must not round differently.
 # 2: full optimisation, for code that runs often. 1: few passes; projection of the speeds of a bicycle
 # compiles in 0.51 s instead of 0.84 and takes 2.4 us per lane instead of 1.6. 0: fast register allocation;
 # 12,000 sequential operations compile in 0.07 s instead of 0.72 (1) and 1.33 (2), and run at half the speed.
@@ -100,9 +100,7 @@ def lanes() -> int:
 
 
 def registers() -> int:
-    """Return the number of values that fit in vector registers, with four
-    registers reserved for instructions.
-    """
+    """Return the number of values that fit in vector registers; four registers stay free for instructions."""
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
 
@@ -127,7 +125,7 @@ def _machine(effort: int):
 
 
 def description() -> str:
-    """Return everything except the program on which machine code depends."""
+    """Return what machine code depends on besides the program: processor, compiler and effort."""
     machine = (
         f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
     )
@@ -183,10 +181,10 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """Return `make()` from the cache file of this name if that is intact, otherwise compute and store
-    it. Disk errors are ignored.
+    """Return the content of the cache file of this name, or `make()`, which is then stored, if the file is
+    missing or damaged. Disk errors are ignored.
 
-    `made_by`: further conditions for reuse, namely versions of the tools, as text.
+    `made_by`: versions of the tools, as text; content of other versions counts as damaged.
     """
     place = folder()
     if place is None or not _is_ours(place):
@@ -232,7 +230,7 @@ def _against(found: os.stat_result) -> str:
 @functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"the folder `{place}` is not used to cache machine code, which every process must then compile: "
+        f"the folder `{place}` is not used to cache machine code, so every process compiles it: "
         f"{against}; set JOURDAIN_JAX_CACHE to a folder of your own (0: none)",
         stacklevel=2,
     )

@@ -8,7 +8,7 @@ from collections import Counter
 
 
 def with_inlining(text: str) -> str:
-    """Return a module that inlines small functions and those called once, and marks all others `noinline`."""
+    """Return the module with small functions and functions called once marked for inlining, others not."""
     parts = {
         found[1]: found[0]
         for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)
@@ -21,12 +21,8 @@ def with_inlining(text: str) -> str:
 
     def size(name: str) -> int:
         if name not in sizes:
-            written_out = {
-                inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)
-            }
-            sizes[name] = parts[name].count("\n") + sum(
-                count * size(inner) for inner, count in written_out.items()
-            )
+            inlined = [inner for inner in calls[name] if inner in parts and is_small(inner)]
+            sizes[name] = parts[name].count("\n") + sum(calls[name][inner] * size(inner) for inner in inlined)
         return sizes[name]
 
     def is_small(name: str) -> bool:

@@ -1,7 +1,8 @@
 """Builder of LLVM IR text with operators on values: vectors with one number per lane, and scalars for loops.
 
-`a + b`, `a < b`, `where(c, a, b)` each append an instruction to the current function. Python numbers become
-literals. No flags allow LLVM to change results: every lane is rounded as written here, whatever the width.
+Each of `a + b`, `a < b`, `where(c, a, b)` appends an instruction to the current function. Python numbers
+become literals. No flag allows LLVM to change results, so every lane is rounded as written, whatever the
+width.
 
 On a GPU (`device`) every thread runs the same code with its own lane; the threads of a warp meet
 (`together`) where the loop over steps continues.
@@ -17,10 +18,11 @@ from jourdain_jax.kernels.ir_value import COMPARED, Value
 
 
 class Writer:
-    """Builder of a module of functions on vectors of `lanes` doubles; `fused`: whether `fma` rounds once.
+    """Builder of a module of functions on vectors of `lanes` doubles.
 
-    `threads`: the number of threads that share the lanes on a CPU. `device`: whether it is for a GPU; then
-    `scratch` states the doubles of external memory per slot (0: none) and the bytes for all threads.
+    `fused`: whether `fma` rounds once; `threads`: number of threads that share the lanes on a CPU; `device`:
+    whether the module is for a GPU. `scratch`: for a GPU, the doubles of external memory per slot (0: none)
+    and the bytes for all threads.
     """
 
     eps = 2.0**-52
@@ -59,10 +61,8 @@ class Writer:
     @contextmanager
     def procedure(self, name: str, arguments: str) -> Iterator[list[Value]]:
         """Write a function without result; `arguments`: pointers, and others as `name:type`."""
-        known, pairs = (
-            {"": "ptr", "real": self.real, "noalias": "ptr noalias"},
-            (argument.partition(":") for argument in arguments.split()),
-        )
+        known = {"": "ptr", "real": self.real, "noalias": "ptr noalias"}
+        pairs = (argument.partition(":") for argument in arguments.split())
         types = {n: known.get(type, type) for n, _, type in pairs}
         with self.function(name, "void", types, attributes="noinline") as given:
             yield given
@@ -213,7 +213,7 @@ class Writer:
         self._declared[name] = text
 
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
-        """Return the result of a function that the module contains once; `body(w, *arguments)` writes it."""
+        """Call a function that `body(w, *arguments)` writes once per module, and return its result."""
         function = f"shared_{name}"
         self.once(
             function,
@@ -279,12 +279,11 @@ class Writer:
         )
 
     def together(self, a: Value) -> Value:
-        """Return whether a value is true in any thread of a warp, whose threads wait
-        here. On a CPU, return the value.
+        """Return whether a value is true in any thread of a warp, whose threads wait here; on a CPU, the
+        value.
         """
-        return (
-            self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
-        )
+        everyone = self.literal(-1, "i32")
+        return self.external("llvm.nvvm.vote.any.sync", "i1", everyone, a) if self.device else a
 
     def thread(self) -> tuple[Value, Value]:
         """Return the index of a GPU thread and the number of threads."""
@@ -307,8 +306,8 @@ class Writer:
         return Value(self, "ptr", f"@{name}")
 
     def room(self, count: int = 1, type: str = "") -> Value:
-        """Allocate stack memory for `count` values (by default one vector of lanes each),
-        once per call of the function.
+        """Allocate stack memory for `count` values of a type (default: a vector of lanes), once per call of
+        the function.
         """
         self._count += 1
         type = type or self.real
@@ -329,19 +328,13 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, so that it occupies no register; on a GPU, the value itself."""
-        if self.device:
+        """Return a value reloaded from memory, which needs no register until then; on a GPU, the value."""
+        if self.device or not value.place:
             return value
-        return (
-            self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}")
-            if value.place
-            else value
-        )
+        return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}")
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Return pointers to rows of memory, each in its own register, from which LLVM
-        reaches nearby rows by offsets.
-        """
+        """Return pointers to rows of memory, each in a register. LLVM reaches nearby rows by offsets."""
         assert not self.device
         found, place = [], self.room(type="ptr")
         for row in rows:

@@ -1,14 +1,17 @@
 """Exponentials, logarithms, powers and hyperbolic functions of vectors of doubles, named as in
 `calculus/scalar_operations.py`.
 
-    e^x = 2^k (1 + p),  k = round(x/ln 2),  p = r + r^2 P(r),  r = x - k ln 2
-    log x = k ln 2 + log m,  sqrt(1/2) < m < sqrt(2),  log m = 2 s (1 + z/3 + z^2/5 + z^3 P(z)),  s = (m - 1)/(m + 1),  z = s^2
-    x^y = e^(y log x)
-    tanh x = -d/(2 + d),  d = e^(-2x) - 1
-    sinh x = (d + d/(1 + d))/2,  d = e^x - 1;   cosh x = (e^x + e^-x)/2;   1/(1 + e^-x) = e^x/(1 + e^x)
+    e^x        = 2^k (1 + p)                            k = round(x/ln 2),  p = r + r^2 P(r),  r = x - k ln 2
+    log x      = k ln 2 + log m                         x = 2^k m,  sqrt(1/2) < m < sqrt(2)
+    log m      = 2 s (1 + z/3 + z^2/5 + z^3 P(z))       s = (m - 1)/(m + 1),  z = s^2
+    x^y        = e^(y log x)
+    tanh x     = -d/(2 + d)                             d = e^(-2x) - 1
+    sinh x     = (d + d/(1 + d))/2                      d = e^x - 1
+    cosh x     = (e^x + e^-x)/2
+    logistic x = e^x/(1 + e^x)
 
-p and log x are in two parts with about 70 bits in all, as powers need. The polynomials P have 11 and 7 terms
-of mpmath's `chebyfit`, which a test reproduces. Errors are below 0.9 ulp.
+Powers need p and log x to about 70 bits, so each is in two parts. The polynomials P have 11 and 7 terms of
+mpmath's `chebyfit`, which a test reproduces. Errors are below 0.9 ulp.
 """
 
 import math
@@ -71,8 +74,8 @@ def _within(w: Writer, x: Value, low: float, high: float) -> Value:
 
 
 def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Value, Value]:
-    """Return k and p, the latter in two parts, for e^(x + more) = 2^k (1 + p); |x| < 2000, and
-    `more` is small relative to it.
+    """Return k and the two parts of p for e^(x + more) = 2^k (1 + p), where |x| < 2000 and `more` is small
+    relative to x.
     """
     shifted = w.fma(x, 1 / math.log(2.0), WHOLE)
     turns, k = shifted - WHOLE, w.converted("bitcast", shifted, w.whole) - _bits(WHOLE)
@@ -147,8 +150,8 @@ def logarithm(w: Writer, x: Value) -> Value:
 
 
 def _logarithm_of_more(w: Writer, x: Value, more: Value | float = 0.0, plus: Value | float = 0.0) -> Value:
-    """Return log(1 + x + more) + plus, where `more` is small relative to x, and `plus` is at
-    most as large as the logarithm.
+    """Return log(1 + x + more) + plus, for `more` small relative to x and `plus` at most as large as the
+    logarithm.
     """
     near = 1.0 + x
     head, less = _logarithm(w, near)
@@ -213,8 +216,8 @@ def cube_root(w: Writer, x: Value) -> Value:
 
 
 def remainder(w: Writer, x: Value, y: Value) -> Value:
-    """Return the remainder of x for division by y rounded towards zero, without round-off: 50
-    bits of the quotient at a time.
+    """Return the remainder of x for division by y rounded towards zero. It is exact: 50 bits of the quotient
+    are subtracted at a time.
     """
     a, b = w.room(), w.magnitude(y)
     w.store(w.magnitude(x), a)

@@ -99,9 +99,7 @@ def _of_device(attribute: int) -> int:
 
 
 def _capabilities() -> list[int]:
-    """Return the supported compute capabilities, times ten. All devices run code for them, because a
-    GPU runs code for older ones.
-    """
+    """Return the compute capabilities, times ten, whose code runs on all devices: equal or older ones."""
     major, minor = 75, 76  # attributes of a device
     own = [
         10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device)
@@ -163,8 +161,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for these `lanes`: as many as registers allow while local memory fits the
-    first-level cache, but at least four per multiprocessor.
+    """Return the number of warps for these `lanes`: at most as many as registers allow and as local memory
+    fits the first-level cache, but at least four per multiprocessor.
     """
     # attributes of a device: 82 its registers, 81 cache usable as shared memory, 16 its multiprocessors
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))

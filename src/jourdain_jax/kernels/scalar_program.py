@@ -1,12 +1,11 @@
 """LLVM IR of a graph of scalars: one vector per node, one lane per motion.
 
-A product used by only one sum or difference is fused with it. Booleans are vectors of bits; in
-arithmetic they count as 0 or 1.
+A product used by only one sum or difference is fused with it. Booleans are vectors of bits; in arithmetic
+they count as 0 or 1.
 
-For long functions, register allocation is decided here. When a register is needed, the value with the
-furthest next use is spilled (L. A. Belady, IBM Systems Journal 5 (1966) 78). The cotangents of a
-bicycle's rates then take 54 kB of code instead of 73 kB. Code that exceeds the first-level instruction
-cache (32 kB) runs more slowly.
+Registers of long functions are allocated here. When a register is needed, the value with the furthest next
+use goes to memory (L. A. Belady, IBM Systems Journal 5 (1966) 78). The cotangents of a bicycle's rates then
+take 54 kB of code instead of 73 kB; code beyond the first-level instruction cache (32 kB) runs more slowly.
 """
 
 import heapq
@@ -73,11 +72,11 @@ def turns(
     return found, count
 
 
-# Number of operations above which registers are allocated here instead of by LLVM. Measured: between 100
-# and 500 it makes no difference; rates of a bicycle (2,115) take 10 % less time than with LLVM's
-# allocation, their cotangents 25 %.
+# Number of operations above which registers are allocated here instead of by LLVM. Measured: limits from 100
+# to 500 make no difference; rates of a bicycle (2,115) take 10 % less time than by LLVM, their cotangents 25
+# %.
 LONG = 200
-REACH = 128  # a one-byte displacement reaches this many rows on either side of a pointer, with wide registers
+REACH = 128  # rows on either side of a pointer that a one-byte displacement reaches, with wide registers
 
 _TRUTHS = {"and": "and", "or": "or"}
 
@@ -96,8 +95,8 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
 def written(
     w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
 ) -> list[Value]:
-    """Return the values of the outputs, given inputs and known nodes. `by_llvm`: let
-    LLVM allocate the registers.
+    """Return the values of the outputs, given inputs and known nodes. `by_llvm`: LLVM allocates the
+    registers.
     """
     return [
         value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))
@@ -107,9 +106,7 @@ def written(
 def written_in_turn(
     w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
 ) -> Iterator[tuple[int, Value]]:
-    """Yield index and value of each output as soon as it is computed, so that the caller can use it at once.
-    Known values stay in memory.
-    """
+    """Yield index and value of each output as soon as it is computed. Known values stay in memory."""
     numbers: dict[int, list[int]] = {}
     for number, node in enumerate(outputs):
         numbers.setdefault(node, []).append(number)
@@ -138,7 +135,7 @@ def written_in_turn(
 
 
 class _AtHand:
-    """Spills values of a long function to memory and reloads them before their next use, as `turns` decides."""
+    """Moves values of a long function to memory, and back before their next use, as `turns` decides."""
 
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
         self.w, self.values, self.places = w, values, dict(values)
@@ -198,7 +195,7 @@ def _made_of(graph: Graph, node: int, fusible: set[int]) -> list[int]:
 
 
 def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[int]) -> set[int]:
-    """Return the products that one sum or difference uses, and nothing else."""
+    """Return the products whose only use is one sum or difference."""
     users: dict[int, list[Any]] = {n: [""] for n in outputs}
     products = set()
     for node in nodes:
@@ -212,9 +209,7 @@ def _used_once_in_a_sum(graph: Graph, nodes: Iterable[int], outputs: Iterable[in
 def _fused(
     w: Writer, graph: Graph, op: str, args: tuple[int, ...], fusible: set[int], values: Mapping[int, Value]
 ) -> Value:
-    """Return x y + b, b - x y or x y - b as a fused multiply-add. If both terms are
-    products, the first one is fused.
-    """
+    """Return x y + b, b - x y or x y - b as a fused multiply-add. Of two products, the first is fused."""
     which = 0 if args[0] in fusible else 1
     x, y = (as_real(w, values[a]) for a in graph.args[args[which]])
     other = args[1 - which]

@@ -1,5 +1,7 @@
-"""Analyticity of expressions. An expression of +, -, *, /, roots, sines and cosines that is zero at random
-states is zero everywhere. Branches, functions that are flat somewhere, and opaque calls break this rule.
+"""Analyticity of expressions: an analytic expression that is zero at random states is zero everywhere.
+
+Expressions of +, -, *, /, roots, sines and cosines are analytic; branches and opaque calls are not. A
+function that is flat somewhere also breaks the rule.
 """
 
 from collections.abc import Callable, Collection, Iterable

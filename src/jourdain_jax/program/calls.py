@@ -21,9 +21,7 @@ from jourdain_jax.program.graph import Unsupported
 
 
 class Call:
-    """Closed jaxpr, and the reason why it is kept as a call. Two calls are equal if they do the same
-    operations.
-    """
+    """Closed jaxpr that is kept as a call, and the reasons. Calls of the same operations are equal."""
 
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
@@ -51,10 +49,8 @@ class Call:
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Return the derivatives of each result with respect to the moving entries of the operands, which
-        form the leading axis.
-
-        Raises `Unsupported` if JAX has no forward derivative.
+        """Return a call whose results are the derivatives of each result, with an axis of the moving entries
+        of the operands first. Raises `Unsupported` if JAX has no forward derivative.
         """
         function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
         places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]
@@ -144,8 +140,8 @@ _SEVERAL = tuple, list  # defined once, because writing a union creates a new ty
 
 
 def description(x) -> Hashable:
-    """Return a key of a jaxpr or of a primitive's parameter. Two traces of one function have equal keys
-    unless it creates other functions.
+    """Return a key of a jaxpr or of a primitive's parameter. Two traces of a function have equal keys, unless
+    it creates other functions.
     """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))

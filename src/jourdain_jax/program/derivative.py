@@ -1,11 +1,11 @@
 """Derivatives on the graph: directional derivatives, cotangents, Jacobians, and JAX programs with such rules.
 
-A JAX program gets its own derivative rule, with its Jacobian derived on the graph:
+A JAX program with outputs o_i of variables x_j gets its own derivative rule from the Jacobian on the graph:
 
     d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and each other
 
 The entries are computed once, with the values, for any number of tangents, and reverse mode stores nothing
-else. JAX differentiates programs with a large Jacobian or with an operation that has no rule on the graph.
+else. A program with a large Jacobian, or with an operation without a rule on the graph, is left to JAX.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,8 +23,8 @@ from jourdain_jax.program.graph import ARRAYS, Graph, NodeList, Unsupported
 
 
 def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> NodeList:
-    """Return d output/ds for each output, where `direction[n]` is dn/ds. Nodes in `direction` count as
-    independent.
+    """Return d output/ds for each output; `direction`: dn/ds for each node n that moves with s. Nodes in
+    `direction` count as independent.
     """
     return [rates.get(0, graph.zero) for rates in directional_derivative(graph, outputs, {0: direction})]
 
@@ -39,10 +39,10 @@ def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> 
 def directional_derivative(
     graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]
 ) -> list[dict[int, int]]:
-    """Return the derivatives of each output along the directions in which it changes, in one sweep;
-    `directions[k][n]` is dn/ds in direction k.
+    """Return, for each output, its derivative along each direction in which it changes, in one sweep.
 
-    A node in any direction counts as independent in all others.
+    `directions`: k -> dn/ds of each node n in direction k. A node of one direction counts as independent in
+    all directions.
     """
     outputs = list(outputs)
     tangents: dict[int, dict[int, int]] = {}
@@ -104,11 +104,8 @@ def _part(graph: Graph, node: int, i: int, weight: int) -> int:
         share = graph.div(weight, args[1])
         return graph.neg(graph.mul(share, node)) if i else share
     if op == "select":
-        return (
-            graph.zero
-            if i == 0
-            else graph.call("select", args[0], *((weight, graph.zero) if i == 1 else (graph.zero, weight)))
-        )
+        cases = (weight, graph.zero) if i == 1 else (graph.zero, weight)
+        return graph.call("select", args[0], *cases) if i else graph.zero
     slope = _derivative(graph, node, [graph.one if k == i else graph.zero for k in range(len(args))])
     return graph.mul(weight, slope)
 
@@ -126,7 +123,7 @@ def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> li
 
 
 def _derivative(graph: Graph, node: int, dots: list):
-    """Return the rate of a node from the rates of its arguments. The rate of an array or a call is a tuple."""
+    """Return the rate of a node from the rates of its arguments; for arrays and calls, a tuple of rates."""
     op, args = graph.operation(node)
     if all(d == graph.zero for d in dots):
         return graph.zero
@@ -142,8 +139,8 @@ def _derivative(graph: Graph, node: int, dots: list):
 
 
 def _of_call(graph: Graph, node: int, dots: list) -> tuple:
-    """Return the rates `d y_i = sum_j J_ij d x_j` of a call. Another call computes the columns of J for the
-    operands that vary.
+    """Return the rates `d y_i = sum_j J_ij d x_j` of a call with results y_i of operands x_j. Another call
+    computes the columns of J for the operands that vary.
     """
     operands, call = graph.args[node], graph.value[node]
     entries = [graph.entries_of(a) for a in operands]
@@ -172,7 +169,8 @@ def differentiable(
     graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()
 ) -> Callable[..., tuple]:
     """Return a JAX function of the values of `variables`, on which all outputs must depend. It returns the
-    `outputs` in the shape and precision of variable `like`, then the nodes `monitored`, without derivatives.
+    `outputs` and then the nodes `monitored`, which get no derivatives, in the shape and precision of variable
+    `like`.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
@@ -229,7 +227,7 @@ def on_its_own(
 def _entries(
     graph: Graph, outputs: Sequence[int], variables: Sequence[int]
 ) -> list[tuple[int, int, int]] | None:
-    """Return row, column and node of each structurally nonzero entry, or None if JAX's derivative is better."""
+    """Return row, column and node of each structurally nonzero entry; None if JAX's derivative is better."""
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None
@@ -242,8 +240,5 @@ def _entries(
         return None
     entries = [(i, j, rows[i][n]) for j, n in enumerate(variables) for i in range(len(rows)) if n in rows[i]]
     # values and Jacobian may take at most 8 times the operations of the values
-    return (
-        entries
-        if graph.operations([*outputs, *(node for *_, node in entries)]) <= 8 * max(operations, 10)
-        else None
-    )
+    with_entries = graph.operations([*outputs, *(node for *_, node in entries)])
+    return entries if with_entries <= 8 * max(operations, 10) else None

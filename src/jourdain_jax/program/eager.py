@@ -1,5 +1,6 @@
-"""Functions traced and evaluated operation by operation in NumPy. A first call takes a tenth of the time of a
-compilation.
+"""Functions that are traced and evaluated in NumPy, operation by operation.
+
+A first call takes a tenth of the time of a compilation.
 """
 
 from collections.abc import Callable
@@ -41,8 +42,8 @@ def eval_numpy(f: Callable) -> Callable:
 
 
 def _as_known(x):
-    """Return a number as a NumPy array, anything else as it is. Booleans stay static, because they decide
-    which code is traced.
+    """Return a number as a NumPy array, and any other value unchanged. Booleans are unchanged, because they
+    decide which code is traced.
 
     **Raises** ValueError for a quantity with a unit.
     """
@@ -90,11 +91,8 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
             return f(*jax.tree.unflatten(treedef, leaves))
 
         def of_all(*leaves):
-            return (
-                jax.vmap(one, [None if i < first else 0 for i in range(len(leaves))])(*leaves)
-                if count
-                else one(*leaves)
-            )
+            axes = [None if i < first else 0 for i in range(len(leaves))]
+            return jax.vmap(one, axes)(*leaves) if count else one(*leaves)
 
         def one_by_one(*leaves):  # for callbacks that take one sample at a time
             return jax.lax.map(lambda lane: one(*leaves[:first], *lane), leaves[first:])
@@ -111,11 +109,8 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
         first = len(jax.tree.leaves(arguments[:shared]))
         arrays = [np.asarray(x) for x in leaves]
         shapes = tuple((x.shape[i >= first :], x.dtype) for i, x in enumerate(arrays))
-        closed, structure = (
-            traced(treedef, shapes, first, len(arrays[first]))
-            if first < len(arrays)
-            else traced(treedef, shapes)
-        )
+        batch = (first, len(arrays[first])) if first < len(arrays) else ()
+        closed, structure = traced(treedef, shapes, *batch)
         with np.errstate(all="ignore"):
             return jax.tree.unflatten(structure, evaluated(closed, arrays, applied))
 

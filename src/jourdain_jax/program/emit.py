@@ -1,8 +1,8 @@
-"""JAX code of a graph: one array per scalar, so that a batch is a structure of arrays without stacking.
+"""JAX code of a graph: each scalar is one array over the batch, so nothing is stacked.
 
 Deep programs run in pieces. XLA makes a separate loop for each result and repeats shared parts in each, so it
-would compute the shared parts of long chains many times. At the end of each piece, values needed later are
-computed together.
+would compute the shared parts of long chains many times. At the end of each piece, the values for later
+pieces are computed together.
 
 Sine and cosine of one argument are computed together. In double precision they use range reduction with pi/2
 in three parts and polynomials, with an error of about 2e-16; XLA on CPUs would call libm once per element and
@@ -20,16 +20,14 @@ from jourdain_jax.program.calls import EMITTED
 from jourdain_jax.program.fused_loop import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
-# longest chain of operations in one piece; measured: chains of links and trailers gain from 100 to 250 on,
-# the bicycle (102) loses a quarter
+# longest chain of operations in a program without pieces; measured: pieces make chains of links and trailers
+# faster from 100 to 250 on, but cost the bicycle (102) a quarter
 DEEP = 120
 PIECE = 128  # operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
-    """Return the values of the outputs as JAX scalars (or numbers), given `known` values of inputs and other
-    nodes.
-    """
+    """Return the values of the outputs as JAX scalars or numbers, from `known` values of other nodes."""
     outputs, values = list(outputs), dict(known)
     needed = graph.needed(outputs, values)
     depth: dict[int, int] = {}  # longest chain of operations that ends in a node

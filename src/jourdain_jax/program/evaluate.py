@@ -20,13 +20,8 @@ class Probes:
         arrays: Mapping[str, Callable] = AT_PROBES,
         constant: Callable = float,
     ):
-        self.graph, self.inputs, self._functions, self._of_arrays, self._constant = (
-            graph,
-            dict(inputs),
-            functions,
-            arrays,
-            constant,
-        )
+        self.graph, self.inputs = graph, dict(inputs)
+        self._functions, self._of_arrays, self._constant = functions, arrays, constant
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         self._row: dict[int, int] = {}  # row of the table, by node
         self._table = np.empty((256, self.count))
@@ -52,8 +47,8 @@ class Probes:
         return int(signs.pop()) if len(signs) == 1 else 0
 
     def in_the_middle(self, node: int) -> int:
-        """Return the node as a function of parameters only. Inputs take their values at the probe where its
-        magnitude is the median. Without such a probe, return 1.
+        """Return the node as a function of parameters only: other inputs have their values at the probe with
+        the median magnitude. If no probe has a nonzero value, return 1.
         """
         graph, size = self.graph, np.abs(self([node])[0])
         known = np.flatnonzero(np.isfinite(size) & (size > 0))
@@ -61,13 +56,8 @@ class Probes:
             return graph.one
         k = known[np.argsort(size[known])[known.size // 2]]
         varying = [n for n in graph.reachable([node]) if graph.op[n] == "input" and graph.varies[n]]
-        return graph.substituted(
-            [node],
-            {
-                n: graph.const(float(np.broadcast_to(self.inputs[str(graph.value[n])], self.count)[k]))
-                for n in varying
-            },
-        )[0]
+        value = lambda n: float(np.broadcast_to(self.inputs[str(graph.value[n])], self.count)[k])
+        return graph.substituted([node], {n: graph.const(value(n)) for n in varying})[0]
 
     def _compute(self, nodes) -> None:
         graph, row = self.graph, self._row

@@ -1,4 +1,5 @@
-"""Several values of one shape computed in one loop over their elements, with shared parts computed once.
+"""Several values of one shape, computed in one loop over their elements. Their shared parts are computed
+once.
 
 XLA on CPUs makes a separate loop for each result of a program and repeats shared parts in each. A reduction
 over several operands is one loop, so each value is padded with a zero and reduced. To JAX this is the

@@ -1,7 +1,8 @@
-"""Hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded.
+"""Hash-consed graph of scalar expressions: equal expressions are one node.
 
-Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of
-square roots, sin(-x), cos(-x). Arguments of sums and products are ordered, so that a b and b a are one node.
+Simplified are constants, 0 + x, 0 x, 1 x, x - x, squares of square roots, sin(-x) and cos(-x). Signs move
+outwards, so that a - (-b) = a + b. Arguments of sums and products are ordered, so that a b and b a are one
+node.
 """
 
 import math
@@ -29,11 +30,11 @@ class Unsupported(Exception):
 
 
 class Graph:
-    """Graph whose nodes are integers: `op[n]` and `args[n]` define node n, `value[n]` is a constant's number,
-    an input's name, or a call.
+    """Graph whose nodes are integers. `op[n]` and `args[n]` are the operation and the arguments of node n,
+    `value[n]` is the number of a constant, the name of an input, or a call.
 
-    Matrix products with more than `most_multiplications` are not expanded; with `keeps_rules`, neither are
-    functions with a custom derivative.
+    `most_multiplications`: of a matrix product; larger products stay calls. `keeps_rules`: whether functions
+    with a custom derivative stay calls.
     """
 
     def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
@@ -204,11 +205,9 @@ class Graph:
     def div(self, a: int, b: int) -> int:
         """a / b"""
         if self.op[b] == "const" and self.value[b] != 0:
-            return (
-                self.mul(a, self.const(1 / self.value[b]))
-                if self.op[a] != "const"
-                else self.const(self.value[a] / self.value[b])
-            )
+            if self.op[a] == "const":
+                return self.const(self.value[a] / self.value[b])
+            return self.mul(a, self.const(1 / self.value[b]))
         if a == self.zero:
             return a
         if self.op[a] == "neg":
@@ -234,7 +233,7 @@ class Graph:
         return result
 
     def call(self, op: str, *args: int) -> int:
-        """Return any other function of scalars, by name, folded if all arguments are constants."""
+        """Return a function of scalars by name; a constant if all arguments are constants."""
         if op in _ARITHMETIC:
             return getattr(self, op)(*args)
         if all(self.op[a] == "const" for a in args):
@@ -258,13 +257,11 @@ class Graph:
     def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
         """Combine scalars into an array, or return the existing array of exactly these entries."""
         entries = tuple(entries)
-        whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
-        if (
-            whole is not None
-            and self.value[whole][1:] == (shape, dtype)
-            and entries == tuple(self.entries(whole).ravel().tolist())
-        ):
-            return whole
+        if entries and self.op[entries[0]] == "entry":
+            (whole,) = self.args[entries[0]]
+            alike = self.value[whole][1:] == (shape, dtype)
+            if alike and entries == tuple(self.entries(whole).ravel().tolist()):
+                return whole
         return self._node("array", entries, (shape, dtype))
 
     def opaque(self, call, operands: Iterable[int]) -> int:
@@ -355,7 +352,7 @@ class Graph:
         return sorted(seen)  # arguments have smaller indices than the nodes that use them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """Return the numeric nodes that depend only on parameters and are used by varying nodes."""
+        """Return the numbers that depend only on parameters and that varying nodes use."""
         outputs = list(outputs)
         found = {
             a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]
@@ -378,9 +375,8 @@ class Graph:
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
-                new[node] = (
-                    self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
-                )
+                given = tuple(new[a] for a in args)
+                new[node] = self._node(self.op[node], given, self.value[node]) if args else node
         return [new[n] for n in outputs]
 
     def _divides_once(self, node: int, uses: dict[int, int], outputs: NodeList) -> bool:

@@ -86,13 +86,13 @@ class IdentityProbes:
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 
     def varies(self, name: str) -> bool:
-        """Return whether an input provably varies between probes."""
+        """Return whether an input differs between probes by more than round-off."""
         x, error = (np.broadcast_to(x, self.count) for x in (self.inputs[name], self._errors.get(name, 0.0)))
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """Return the probes with indices `at`, copied once per group of names. In each copy, the inputs of
-        one group take their values from another probe.
+        """Return the probes with indices `at`, copied once per group of input names. In each copy, the inputs
+        of its group have the values of another probe.
         """
 
         def in_turn(name, x):
@@ -114,15 +114,15 @@ def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return, for each pair of rows (values at generic probes), whether they are equal to round-off at the
-    `regular` probes.
+    """Return which rows of `a` and `b`, values at generic probes, are equal up to round-off at the `regular`
+    probes.
     """
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
 
 
 def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return, for each pair of rows, whether no probe distinguishes their values."""
+    """Return which values of `a` and `b` may be equal: they agree up to round-off, or are not finite."""
     bound = SURE * (a.error + b.error)
     said = np.isfinite(bound) & regular
     a, b = np.asarray(a), np.asarray(b)
@@ -131,8 +131,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return those entries of `replacement` (node -> its substitute) that change no value of `nodes`; each
-    is tested alone. `probes`: generic ones.
+    """Return the entries of `replacement` (node -> substitute) that, each alone, change no value of `nodes`
+    at generic `probes`.
     """
     graph, here = probes.graph, probes(nodes)
 
@@ -197,7 +197,7 @@ def on_rows(
     probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]
 ) -> IdentityProbes:
     """Return `probes` with `coordinates` (names of inputs -> nodes) projected onto rows = 0 by Gauss-Newton
-    from `near`. Probes without convergence become meaningless.
+    from `near`. Probes without convergence get infinite bounds.
 
     The probes stay unchanged if the rows contain a function that identity probes replace.
     """
@@ -230,7 +230,6 @@ def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
 
 
 # Generic replacements of other functions, for values and bounds.
-# -----------------------------------------------
 
 
 def _generic(name: str) -> Callable:

@@ -1,5 +1,5 @@
-"""Interpreter of a jaxpr over scalars: every array is an array of nodes of a `Graph`, every primitive acts on
-its entries.
+"""Interpreter of a jaxpr over scalars. Every array is an array of nodes of a `Graph`; primitives act on its
+entries.
 
 Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive
 without a rule raises `Unsupported`; `opaque_calls.py` then keeps its surroundings as a call.
@@ -76,11 +76,8 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
     """Return the results of one equation."""
     name = equation.primitive.name
     refuse(equation)
-    if (
-        graph.keeps_rules
-        and (rule := own_rule(name, equation.params))
-        and any(isinstance(x, Nodes) for x in inputs)
-    ):
+    symbolic = any(isinstance(x, Nodes) for x in inputs)
+    if graph.keeps_rules and symbolic and (rule := own_rule(name, equation.params)):
         raise Unsupported(rule)
     inner = called(name, equation.params)
     if inner is not None:
@@ -93,7 +90,6 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
         return [Nodes(choose([inputs[0], *cases])) for cases in zip(*found, strict=True)]
     if not equation.outvars:
         raise Unsupported(f"the operation `{name}`")
-    symbolic = any(isinstance(x, Nodes) for x in inputs)
     out = equation.outvars[0].aval
     if name == "convert_element_type" and symbolic:
         return [_converted(graph, as_nodes(graph, inputs[0]), equation.invars[0].aval.dtype, out.dtype)]
@@ -138,11 +134,10 @@ def refuse(equation) -> None:
 
 
 def own_rule(name: str, params) -> str:
-    """Return the name of the function if it has a custom derivative unknown to the graph; empty if not.
-    Functions of this package do not count, because their custom derivatives equal those of their operations.
+    """Return the name of a function with a custom derivative that the graph lacks; empty for other functions.
 
-    JAX's own functions do count: `softplus` and `sinc` compute with branches, which have wrong derivatives
-    where two branches meet.
+    Functions of this package do not count: their custom derivatives equal those of their operations.
+    Functions of JAX count: `softplus` and `sinc` have branches, whose derivatives are wrong where they meet.
     """
     if name == "stop_gradient":
         return "`stop_gradient`, which sets its derivative to zero,"
@@ -155,11 +150,10 @@ def own_rule(name: str, params) -> str:
 
 
 # Primitives that move entries.
-# ---------------------------------------------------------------------------------
 
 
 def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.ndarray]:
-    """Return nodes moved as numbers would be; numbers among them become constants."""
+    """Return nodes moved by a primitive like numbers; numbers among them become constants."""
     entries = _MOVES[name](len(inputs))
     if any(isinstance(x, Nodes) for i, x in enumerate(inputs) if i not in entries):
         raise Unsupported("an index that depends on the state")
@@ -221,7 +215,7 @@ _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
     **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),
 }
-# All others move node indices as `program/numpy_backend.py` moves numbers.
+# `program/numpy_backend.py` moves the node indices of all others, as if they were numbers.
 _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,
@@ -249,16 +243,15 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
         return Nodes(ids)
     if kinds[1] not in ("f", "b") and kinds[0] != "b":
         raise Unsupported("an integer that depends on the state")
-    one = (
-        (lambda n: graph.call("select", n, graph.zero, graph.one))
-        if old.kind == "b"
-        else (lambda n: graph.call("ne", n, graph.zero))
-    )
-    return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
+    nodes = ids.ravel().tolist()
+    if old.kind == "b":
+        found = [graph.call("select", n, graph.zero, graph.one) for n in nodes]
+    else:
+        found = [graph.call("ne", n, graph.zero) for n in nodes]
+    return Nodes(np.array(found, np.int64).reshape(ids.shape))
 
 
 # Primitives on entries.
-# ----------------------------------------------------------------------------------------------
 
 
 def _call(op: str) -> Callable:

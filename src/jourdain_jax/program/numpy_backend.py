@@ -52,11 +52,8 @@ def _scan(equation, inputs) -> list[np.ndarray]:
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
         result = evaluated(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)], applied)
         before_last, before, carry = before, carry, result[:carried]
-        if (
-            not xs
-            and not outs
-            and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0))
-        ):
+        in_cycle = _equal(carry, before_last) and (params["length"] - done) % 2 == 0
+        if not xs and not outs and (in_cycle or _equal(carry, before)):
             return carry  # a fixed point or a cycle of two: further iterations change nothing
         for out, y in zip(outs, result[carried:], strict=True):
             out.append(y)
@@ -81,28 +78,20 @@ def _while(equation, inputs) -> list[np.ndarray]:
         if not np.any(going):
             return carry
         new = evaluated(params["body_jaxpr"], [*of_body, *carry], applied)
-        carry = (
-            new
-            if going.ndim == 0
-            else [
-                np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o)
-                for n, o in zip(new, carry, strict=True)
-            ]
-        )
+        pairs = zip(new, carry, strict=True)
+        carry = new if going.ndim == 0 else [np.where(_shaped_for(n, going), n, o) for n, o in pairs]
     if np.all(going):
         raise ValueError(
             f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; check its "
             "condition or bound it, such as `lambda state: (state[0] < 50) & ...`"
         )
     # some samples have ended; the results of the others are unknown, so NaN
-    return [
-        (
-            np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype)
-            if x.dtype.kind == "f"
-            else x
-        )
-        for x in carry
-    ]
+    unknown = lambda x: np.where(_shaped_for(x, going), np.nan, x).astype(x.dtype)
+    return [unknown(x) if x.dtype.kind == "f" else x for x in carry]
+
+
+def _shaped_for(x: np.ndarray, going: np.ndarray) -> np.ndarray:
+    return going.reshape(going.shape + (1,) * (x.ndim - going.ndim))
 
 
 def _where(equation) -> str:
@@ -265,8 +254,8 @@ def _triangular_solve(equation, A, b):
 
 
 def _lu(equation, A):
-    """Return the LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their
-    permutation. Leading axes are a batch.
+    """Return the LU decomposition with partial pivoting, like LAPACK's getrf: factors, row exchanges and
+    their permutation. Leading axes are batch axes.
     """
     *lanes, rows, columns = A.shape
     LU = np.array(A).reshape(-1, rows, columns)
@@ -274,11 +263,8 @@ def _lu(equation, A):
     order = np.broadcast_to(np.arange(rows, dtype=np.int32), (len(LU), rows)).copy()
     for k in range(swaps.shape[1]):
         swaps[:, k] = best = k + np.argmax(np.abs(LU[:, k:, k]), axis=1)
-        for exchanged in (LU, order):
-            exchanged[every, k], exchanged[every, best] = (
-                exchanged[every, best].copy(),
-                exchanged[every, k].copy(),
-            )
+        for x in (LU, order):
+            x[every, k], x[every, best] = x[every, best].copy(), x[every, k].copy()
         pivot = LU[:, k, k, None]
         LU[:, k + 1 :, k] /= np.where(pivot == 0, 1, pivot)
         LU[:, k + 1 :, k + 1 :] -= LU[:, k + 1 :, k, None] * LU[:, k, None, k + 1 :]
@@ -314,11 +300,10 @@ def _reshaped(equation, x, *dynamic):
 
 
 def places(shape: Sequence[int], indices: np.ndarray, sizes: Sequence[int], axes, lanes, mode) -> np.ndarray:
-    """Return the flat places, in an array of this shape, of the windows of these sizes that begin at
-    `indices` along `axes`; -1 for a window beyond the array, unless the mode moves it inside.
+    """Return the flat places of windows in an array of this shape; their axes follow the axes of the indices.
 
-    `lanes`: pairs of an axis of the array and the axis of the indices that it goes along with. Axes of the
-    indices come first, those of windows last.
+    The windows have the given sizes and begin at `indices` along `axes`. A window beyond the array has places
+    -1, unless the mode moves it inside. `lanes`: pairs of a batch axis of the array and of the indices.
     """
     begin = np.zeros((*indices.shape[:-1], len(shape)), int)
     begin[..., list(axes)] = indices

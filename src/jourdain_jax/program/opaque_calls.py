@@ -1,10 +1,10 @@
-"""Interpreter of a jaxpr over scalars that keeps parts without scalar form as calls.
+"""Interpreter of a jaxpr over scalars that keeps parts without scalar form as calls of JAX.
 
 An equation without a rule is opaque. Equations that exchange large arrays with it, and equations between two
-opaque ones, become opaque as well, so a network is one call. Each equation has a level:
+opaque ones, become opaque as well, so a neural network is one call. Each equation has a level:
 
-    level of a scalar = the largest level of its operands
-    level of an opaque equation = the same, plus one after a scalar
+    of scalars        the largest level of its operands
+    opaque            the same, but one more than the level of a scalar operand
 
 Connected opaque equations of one level form one call.
 """
@@ -39,10 +39,8 @@ class _Variable:
 
     @property
     def may_be_scalars(self) -> bool:
-        return (
-            bool(np.issubdtype(self.aval.dtype, np.floating) or self.aval.dtype == bool)
-            and self.aval.size <= LARGEST
-        )
+        kind = np.issubdtype(self.aval.dtype, np.floating) or self.aval.dtype == bool
+        return bool(kind) and self.aval.size <= LARGEST
 
 
 @dataclass(eq=False)
@@ -81,9 +79,7 @@ class _Opaque:
 
 
 def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[Value]:
-    """Return the outputs of a closed jaxpr, as `interpret` does, with calls for the parts that have no scalar
-    form.
-    """
+    """Return the outputs of a closed jaxpr as `interpret`, with calls for parts that have no scalar form."""
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
     outputs = _flat(needed_only(closed), inputs, steps)
@@ -95,7 +91,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     asked = {v for v in outputs if isinstance(v, _Variable)}
     _put_together(steps, users, asked)
     values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
-    # otherwise in their original order
+    # by level, scalars last, otherwise in their original order
     for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):
         if not step.opaque:
             results = apply(
@@ -108,9 +104,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
-    """Append all equations, inlining inner jaxprs except functions with custom derivatives; return the
-    outputs.
-    """
+    """Append all equations, also of inner jaxprs without a custom derivative; return the outputs."""
 
     def results(equation, inputs: list) -> list:
         name = equation.primitive.name
@@ -125,7 +119,7 @@ def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
 
 
 def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:
-    """Mark the steps without scalar form as opaque, by trial; return the variables that are numbers."""
+    """Find the steps without scalar form by trial and mark them as opaque; return the known numbers."""
     values: dict = {}
 
     def introduce(v: _Variable) -> Nodes | None:
@@ -176,9 +170,8 @@ def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked
         inside = all(
             v not in asked and v in users and all(user.opaque for user in users[v]) for v in step.outputs
         )
-        step.opaque = step.opaque or (
-            inside and (any(v.is_large for v in step.outputs) or bool(from_opaque(step)))
-        )
+        beside = any(v.is_large for v in step.outputs) or bool(from_opaque(step))
+        step.opaque = step.opaque or (inside and beside)
     for step in steps:
         made_by = [maker[v] for v in step.variables if v in maker]
         if not step.opaque:
@@ -222,13 +215,8 @@ def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]
     def function(*arrays):
         known = dict(zip(operands, arrays, strict=True))
         for step in part:
-            known |= dict(
-                zip(
-                    step.outputs,
-                    step.results([known[x] if isinstance(x, _Variable) else x for x in step.inputs]),
-                    strict=True,
-                )
-            )
+            given = [known[x] if isinstance(x, _Variable) else x for x in step.inputs]
+            known |= dict(zip(step.outputs, step.results(given), strict=True))
         return [known[v] for v in results]
 
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))

@@ -1,9 +1,10 @@
 """Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a
 short expression.
 
-Atoms are inputs and everything but +, -, *: sines, cosines, square roots, reciprocals. Expansion cancels
-equal terms. Reconstruction groups terms by their varying part, whose coefficient (a polynomial in parameters)
-is computed once per motion. It then factors greedily (multivariate Horner scheme).
+Atoms are inputs and all nodes other than sums, differences and products: sines, cosines, square roots,
+reciprocals. Expansion cancels equal terms. Reconstruction groups terms by their varying part, whose
+coefficient (a polynomial in parameters) is computed once per motion. It then factors greedily (multivariate
+Horner scheme).
 """
 
 from collections import Counter
@@ -23,13 +24,13 @@ class TooLarge(Exception):
 
 
 class NormalForms:
-    """Normal forms of the nodes of one graph. Squares of sines are replaced by squares of cosines (the
-    reverse took fewer operations in no model).
+    """Normal forms of the nodes of one graph. Squares of cosines replace squares of sines; the reverse took
+    fewer operations in no model.
 
     - `most_terms`: maximum number of terms of a normal form; 0: nodes stay unchanged.
-    - `sign`: 1, -1 or 0 (unknown) for a node. With a known sign, |x| becomes x or -x, and `guards` records
-      it.
-    - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
+    - `sign`: function from a node to its sign: 1, -1, or 0 if unknown. With a known sign |x| becomes x or -x,
+      and `guards` records that node.
+    - `squares`: atom -> polynomial equal to its square, for one entry of each unit quaternion.
     """
 
     def __init__(
@@ -89,15 +90,8 @@ class NormalForms:
         if op == "input":
             return {(node,): 1.0}
         if op in ARRAYS or op == "entry":
-            return {
-                (
-                    (
-                        node
-                        if not graph.varies[node]
-                        else graph.again(node, [self._rebuilt_or(a) for a in args])
-                    ),
-                ): 1.0
-            }
+            same = not graph.varies[node]
+            return {(node if same else graph.again(node, [self._rebuilt_or(a) for a in args]),): 1.0}
         parts = [p for p in (self._expanded[a] for a in args) if p is not None]
         if len(parts) < len(args):
             raise TooLarge
@@ -153,12 +147,8 @@ class NormalForms:
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
             extra = Counter(large) - Counter(small)
-            if (
-                c == -d
-                and len(large) == len(small) + 2
-                and [*extra.values()] == [2]
-                and self.graph.op[min(extra)] == "cos"
-            ):
+            one_square = len(large) == len(small) + 2 and [*extra.values()] == [2]
+            if c == -d and one_square and self.graph.op[min(extra)] == "cos":
                 return [self.graph.call("sin", self.graph.args[min(extra)][0])], {small: c}
         return None
 
@@ -174,8 +164,8 @@ class NormalForms:
         return self._atom(value) if self.graph.op[value] == "abs" else self.expanded(value)
 
     def _magnitude(self, node: int) -> Polynomial:
-        """Return |x| of a factor extracted from a root. For sines and cosines, as in contact lengths, use the
-        sign at the probes and guard it.
+        """Return |x| of a factor extracted from a root. Sines and cosines, as in lengths of contacts, have
+        the sign of the probes, which is guarded.
         """
         sign = self._sign(node) if self.graph.op[node] in ("sin", "cos") and self.graph.varies[node] else 0
         if sign == 0:
@@ -224,8 +214,8 @@ class NormalForms:
         return result
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
-        """Return the terms of a monomial, with squares replaced and pairs x, 1/x cancelled. The result is
-        cached, because the square of an atom is known before its first use.
+        """Return the terms of a monomial, with squares replaced and pairs x, 1/x cancelled. Caching is valid,
+        because the square of an atom is known before its first use.
         """
         found = self._reductions.get(monomial)
         if found is None:
@@ -272,8 +262,8 @@ class NormalForms:
     # and back
 
     def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
-        """Return a node with few operations for the polynomial, divided by `divisor` (a function of
-        parameters only).
+        """Return a node with few operations for the polynomial p, divided by the node `divisor`, a function
+        of parameters.
         """
         graph = self.graph
         terms = []
@@ -302,11 +292,9 @@ class NormalForms:
         scale = next(iter(q.values()))
         p = self._times({m: c / scale for m, c in p.items()}, self._inverse_atom, common.elements())
         divisor = self.rebuilt({tuple((Counter(m) - common).elements()): c / scale for m, c in q.items()})
-        return (
-            graph.div(self.rebuilt(p), divisor)
-            if graph.varies[divisor]
-            else self.rebuilt(p, None if divisor == graph.one else divisor)
-        )
+        if graph.varies[divisor]:
+            return graph.div(self.rebuilt(p), divisor)
+        return self.rebuilt(p, None if divisor == graph.one else divisor)
 
     def cramer(self, M: list[NodeList], f: NodeList) -> NodeList:
         """Return `M^-1 f` in normal form by Cramer's rule, for up to three unknowns."""

@@ -21,8 +21,8 @@ class Projected(NamedTuple):
 
 
 def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
-    """Return the probes with `inputs` (names -> nodes) moved to the nearest point where all rows are 0.
-    `limits`: of the steps, as in `nearest_root`.
+    """Return the probes with `inputs` (names -> nodes) moved to the nearest point where all rows are zero.
+    `limits`: limits of the steps, as in `nearest_root`.
     """
     graph = probes.graph
     needed = set(graph.reachable(rows))
@@ -60,6 +60,5 @@ def _slopes_by_entries(
         for n, slope in row.items()
         if slope != graph.zero
     ]
-    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [
-        slope for *_, slope in entries
-    ]
+    pattern = Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place)))
+    return pattern, [slope for *_, slope in entries]

@@ -37,8 +37,8 @@ C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 def statements(
     graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s"
 ) -> tuple[list[str], list[str]]:
-    """Return lines that name values used more than once, and the expressions of the outputs. `names`: names
-    of inputs and of known nodes.
+    """Return lines that name values used more than once, and the expressions of the outputs. `names`: node ->
+    name, for inputs and known nodes.
     """
     nodes = _needed(graph, outputs, names)
     uses = Counter([*outputs, *(a for node in nodes for a in graph.args[node])])
@@ -71,14 +71,8 @@ def _expression(graph: Graph, node: int, written, language: Language) -> tuple[s
     op, args = graph.operation(node)
     if op == "const":
         value = graph.value[node]
-        text = (
-            repr(value)
-            if abs(value) < float("inf")
-            else language.infinity
-            if value > 0
-            else f"-{language.infinity}"
-        )
-        return text, 9 if value >= 0 else 1
+        infinity = language.infinity if value > 0 else f"-{language.infinity}"
+        return repr(value) if abs(value) < float("inf") else infinity, 9 if value >= 0 else 1
     if op == "input":
         return str(graph.value[node]), 9
     if op == "neg":
@@ -103,11 +97,9 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
     for node in _needed(graph, outputs, values):
         op = graph.op[node]
         if op == "const":
-            values[node] = (
-                sympy.nsimplify(graph.value[node], rational=True)
-                if abs(graph.value[node]) < 1e6
-                else sympy.Float(graph.value[node])
-            )
+            value = graph.value[node]
+            exact = abs(value) < 1e6
+            values[node] = sympy.nsimplify(value, rational=True) if exact else sympy.Float(value)
         else:
             function = TABLE[op].sympy
             args = [values[a] for a in graph.args[node]]

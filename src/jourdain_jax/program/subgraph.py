@@ -9,8 +9,8 @@ from jourdain_jax.program.graph import OPERATIONS, Graph
 
 
 def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
-    """Return a new graph with only the needed nodes, and the new index of every node of `graph` (-1 if not
-    needed). It frees the memory of unused expressions.
+    """Return a new graph with only the needed nodes, which frees the memory of the others, and the new index
+    of every node of `graph` (-1 if not needed).
     """
     # in the old order, which keeps the order of terms in sums
     kept = [n for n in graph.reachable(needed) if n > graph.one]
@@ -22,7 +22,7 @@ def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
 
 
 def more_operations(graph: Graph, a: int, b: int) -> int:
-    """Return how many more operations node a needs than node b, not counting shared ones."""
+    """Return the number of operations of node a minus that of node b. Shared operations cancel."""
     if a == b:
         return 0
     needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]

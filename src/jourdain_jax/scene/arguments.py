@@ -2,9 +2,8 @@
 
 The checks read kinds and shapes, which are known during tracing, so compiled programs contain none of them.
 
-Tracebacks of errors in a user's methods show the user's lines and omit those of this package and of JAX. With
-JAX_TRACEBACK_FILTERING=off, as for JAX's own filtering, they show all lines. Errors that pass through no
-user's method keep their whole traceback.
+Tracebacks of errors in a user's methods show the user's lines and omit lines of this package and of JAX. With
+JAX_TRACEBACK_FILTERING=off they show all lines. Other errors keep their whole traceback.
 """
 
 import sys
@@ -58,8 +57,8 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """Return the scene itself. Raises ValueError for anything but a scene, such as the class in place of an
-    instance.
+    """Return the scene of a scene or model. Raises ValueError for any other value, such as the class of a
+    scene.
     """
     if isinstance(scene, Scene):
         return scene
@@ -90,10 +89,8 @@ def as_rolling(scene, what: str) -> Scene:
 
 
 def of_known_numbers(function: F) -> F:
-    """Return a wrapper of a function of a scene or motion. It runs the function on numbers, also inside
-    `jit`, `vmap` and derivatives.
-
-    Raises DifferentiationModeError with the function's name for a traced argument.
+    """Return a function of a scene or motion that runs on concrete numbers, also inside `jit`, `vmap` and
+    derivatives. For a traced argument it raises DifferentiationModeError with its name.
     """
 
     @wraps(function)
@@ -112,25 +109,21 @@ def of_known_numbers(function: F) -> F:
 
 def as_time(t) -> Scalar:
     """Return a time in s, as a number of the default floating-point type."""
-    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(
-        real_type()
-    )
+    advice = "give one time in s; use `jax.vmap` for many"
+    return checked_real(t, "`t`", (), advice=advice).astype(real_type())
 
 
 def one_time(t, name: str = "t"):
-    """Return a time on NumPy unless it is traced; None stays None. Raises ValueError with its name unless it
-    is one number.
+    """Return a time on NumPy unless it is traced; None stays None. Raises ValueError with the name of the
+    argument for any other value.
     """
-    return (
-        None
-        if t is None
-        else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
-    )
+    advice = "give one time in s; use `jax.vmap` for many"
+    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice=advice)
 
 
 def vector_of_times(ts) -> Float[Entries, "times"]:
-    """Return times in s, on NumPy unless they are traced. Raises ValueError unless they are a vector of at
-    least one number.
+    """Return a vector of times in s, on NumPy unless they are traced. Raises ValueError for another shape,
+    and if it is empty.
     """
     ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
     if ts.ndim != 1 or ts.size == 0:
@@ -176,8 +169,8 @@ class ChangingInputs(eqx.Module):
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
-    """Return the scene's inputs at one instant as a vector, from a vector, a dictionary (omitted ones are
-    zero), or None for all zero.
+    """Return the scene's inputs at one instant as a vector. `inputs`: a vector, a dictionary, or None;
+    omitted inputs are zero.
     """
     names = scene.inputs.entries
     if inputs is None:
@@ -212,18 +205,16 @@ _NOTE = (
 
 
 def shown_from_users_lines(function: F) -> F:
-    """Return a wrapper of the function that shortens the traceback of an error to the user's lines, if there
-    are any (in a method of a scene, an input or an event). Inside, JAX promotes types as usual.
+    """Return the function with shorter tracebacks: only the user's lines, if there are any, as in a method of
+    a scene. Inside it, JAX promotes types as usual.
     """
 
     @wraps(function)
     def called(*args, **kwargs):
         __tracebackhide__ = True  # for IPython and pytest
         try:
-            usual = (
-                jax.config.jax_numpy_dtype_promotion == "standard"
-                and jax.config.jax_numpy_rank_promotion == "allow"
-            )
+            modes = jax.config.jax_numpy_dtype_promotion, jax.config.jax_numpy_rank_promotion
+            usual = modes == ("standard", "allow")
             return (function if usual else with_usual_promotion(function))(*args, **kwargs)
         except Exception as error:
             if not _is_shortened(error):

@@ -37,16 +37,16 @@ class RigidBody(eqx.Module):
     - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body
       axes.
     - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to
-      space components. The column `R[:, k]` is body axis k in the inertial frame. The row `R[k]` is not, and
-      no check can detect this mistake.
+      space components. Column k, `R[:, k]`, is body axis k in the inertial frame. The row `R[k]` is a
+      different vector, and no check detects its use as an axis.
     - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only
       (default: none). If `solid` is "box", "ellipsoid" or "wheel", the only point is the corner of the
       solid's bounding box.
 
     Raises ValueError for other shapes. Velocities are derivatives of the pose. A mass or inertia that depends
-    on time or coordinates enters `m a` and `I alpha + omega x I omega` with its momentary value. Mass that
-    leaves or joins carries its momentum away or in; state its thrust as a load. Model a skater who draws in
-    the arms by several bodies.
+    on time or coordinates enters `m a` and `I alpha + omega x I omega` with its momentary value: mass that
+    leaves or joins has the velocity of the body. State a thrust as a load. Model a skater who draws in the
+    arms by several bodies.
     """
 
     mass: Scalar  # kg
@@ -65,19 +65,13 @@ class RigidBody(eqx.Module):
             "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre",
         )
         matrix = checked_real(inertia, what, advice=advice)
-        self.inertia = (
-            jnp.diag(matrix) if matrix.shape == (3,) else checked_real(matrix, what, (3, 3), advice=advice)
-        )
+        matrix = jnp.diag(matrix) if matrix.shape == (3,) else matrix
+        self.inertia = checked_real(matrix, what, (3, 3), advice=advice)
         self.position = checked_real(position, "position of a rigid body", (3,))
-        self.orientation = checked_real(
-            orientation,
-            "orientation of a rigid body",
-            (3, 3),
-            advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)",
-        )
-        self.outline = (
-            jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
-        )
+        advice = "give a rotation matrix, body to space: jj.rot_z(q.yaw)"
+        self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice=advice)
+        outline = jnp.zeros((0, 3)) if outline is None else outline
+        self.outline = checked_real(outline, "outline of a rigid body")
         if self.outline.ndim != 2 or self.outline.shape[1] != 3:
             raise ValueError(
                 f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); "
@@ -112,22 +106,18 @@ class RigidBody(eqx.Module):
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
         mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
-        moment = (
-            checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell")
-            * mass
-            * radius**2
-        )
-        return RigidBody(
-            mass, _stack([moment] * 3), position, orientation, radius * np.ones((1, 3)), "ellipsoid"
-        )
+        advice = "give 2/5 for a solid ball, 2/3 for a shell"
+        moments = [checked_real(factor, "factor of a ball", (), advice=advice) * mass * radius**2] * 3
+        corner = radius * np.ones((1, 3))
+        return RigidBody(mass, _stack(moments), position, orientation, corner, "ellipsoid")
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
-        """Return a thin uniform rod of the given `length` (m) along the body axis `axis` ("x", "y" or "z"),
-        `m l^2/12` about the others.
+        """Return a thin uniform rod of the given `length` l (m) along the body axis `axis` ("x", "y" or "z").
+        Its moments about the other axes are `m l^2/12`.
 
-        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another
-        axis.
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. Raises ValueError for
+        another axis.
         """
         k = _axis_index(axis)
         mass, length = checked_real(mass, "mass of a rod", ()), checked_real(length, "length of a rod", ())
@@ -143,10 +133,8 @@ class RigidBody(eqx.Module):
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
-        mass, sides = (
-            checked_real(mass, "mass of a box", ()),
-            checked_real(sides, "sides of a box", (3,), advice="give three lengths, m"),
-        )
+        mass = checked_real(mass, "mass of a box", ())
+        sides = checked_real(sides, "sides of a box", (3,), advice="give three lengths, m")
         a, b, c = sides[0], sides[1], sides[2]
         moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
         return RigidBody(mass, moments, position, orientation, sides[None] / 2, "box")

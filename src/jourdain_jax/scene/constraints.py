@@ -1,8 +1,8 @@
 """Ready-made constraints.
 
-Geometric constraints are functions of a `Pose` that vanish; the engine differentiates them in time. Velocity
-constraints are functions of a `Motion` that vanish. Each function returns the value of its constraint or
-constraints, to be named in `geometric_constraints` or `velocity_constraints` of a scene.
+Each function returns a value that is zero while the constraint holds. A geometric constraint is a function of
+a `Pose`, to be named in `geometric_constraints` of a scene; the engine differentiates it in time. A velocity
+constraint is a function of a `Motion`, to be named in `velocity_constraints`.
 """
 
 from typing import Any
@@ -35,8 +35,8 @@ def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector, *, holds: Any
     - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq.
       (7). The body axis y is `body.orientation[:, 1]`, a column.
     - `holds`: the largest sideways force F in N, a number or a function of the motion, or
-      `jj.Coulomb(sliding, static)` with two forces. Beyond it the blade slips against F, and holds again when
-      it comes to rest (`motion.phase`). None: it holds any force.
+      `jj.Coulomb(sliding, static)` with two forces. Under a larger force the blade slips against F until the
+      slip has come to rest (`motion.phase`). None: the blade holds any force.
     """
     what = f"the knife edge of `{body.name}`"
     contact = _point(contact, f"contact of {what}")
@@ -68,9 +68,8 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
     """
     if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
         raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
-    return (_point(b, "second point of a pin") - _point(a, "first point of a pin"))[
-        jnp.array(["xyz".index(axis) for axis in axes])
-    ]
+    apart = _point(b, "second point of a pin") - _point(a, "first point of a pin")
+    return apart[jnp.array(["xyz".index(axis) for axis in axes])]
 
 
 def weld(
@@ -78,20 +77,13 @@ def weld(
 ) -> Float[Array, "6"]:
     """Return the geometric constraints (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 
-    The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second =
-    R_first turn` (`turn`: (3, 3), the identity by default). The rotation constraints are `vee` of the
-    antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.
+    The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide. The orientations R
+    satisfy `R_second = R_first turn`, with the rotation matrix `turn` (3, 3), by default the identity. The
+    rotation constraints are `vee(turn' R_first' R_second)`, to first order the vector of the excess rotation.
     """
     for body, which in ((first, "first"), (second, "second")):
         check_kind(body, BodyPose, f"the {which} body of a weld", 'the pose of a body; write pose["name"]')
-    turn = (
-        jnp.eye(3, dtype=first.position.dtype)
-        if turn is None
-        else checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
-    )
-    return jnp.concatenate(
-        [
-            second.place(at_second) - first.place(at_first),
-            vee(turn.T @ first.orientation.T @ second.orientation),
-        ]
-    )
+    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else turn
+    turn = checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
+    apart = second.place(at_second) - first.place(at_first)
+    return jnp.concatenate([apart, vee(turn.T @ first.orientation.T @ second.orientation)])

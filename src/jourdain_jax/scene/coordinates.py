@@ -21,8 +21,8 @@ from jourdain_jax.scene.names import Labels, Named, check_name
 
 @dataclass(frozen=True)
 class Quaternion:
-    """A singularity-free attitude: four coordinates `(w, x, y, z)`, three speeds (body angular velocity,
-    rad/s).
+    """An attitude without singularity: four coordinates `(w, x, y, z)`, and three speeds, the body angular
+    velocity (rad/s).
     """
 
     name: str
@@ -40,8 +40,8 @@ class Names:
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Return the position of `name`. If there is none, raises ValueError with the valid names and the
-        `kind` of name.
+        """Return the position of `name`. Raises ValueError with the valid names for an unknown `kind` of
+        name.
         """
         check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
@@ -139,8 +139,8 @@ def speeds(names: str) -> Names:
 
 
 def inputs(names: str) -> Names:
-    """Return the names of a scene's inputs (such as actuator torques), separated by spaces in `names`; their
-    unit is the scene's. Raises ValueError as in `coordinates`.
+    """Return the names of a scene's inputs, such as actuator torques, separated by spaces in `names`. The
+    scene decides on their units. Raises ValueError as in `coordinates`.
     """
     return _named(names, "input")
 
@@ -177,6 +177,4 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if name == "t" and kind != "input":
             raise ValueError(f'{kind} name `t` is reserved for time (`motion["t"]`); choose another')
         if name in ("array", "slots", "keys"):
-            raise ValueError(
-                f"{kind} name `{name}` is reserved for an attribute of the container; choose another"
-            )
+            raise ValueError(f"{kind} name `{name}` is reserved: `q.{name}` has a meaning; choose another")

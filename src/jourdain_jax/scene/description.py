@@ -1,6 +1,6 @@
 """Checks of a scene's class: spelling of methods, known coordinate names, ordered bounds.
 
-A method with a misspelt name would be ignored silently, and with it a force or a constraint.
+Without them, a method with a misspelt name would be ignored, and with it a force or a constraint.
 """
 
 import difflib
@@ -105,11 +105,9 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """Return a sentence on misspelt methods, attributes and fields of a class; empty if there are none."""
-    own, owners = (
-        {field.name for field in fields(kind)},
-        [owner for owner in kind.__mro__ if owner not in base.__mro__],
-    )
+    """Return a sentence about a misspelt method, attribute or field of a class; empty if there is none."""
+    own = {field.name for field in fields(kind)}
+    owners = [owner for owner in kind.__mro__ if owner not in base.__mro__]
     read = {
         name
         for owner in owners
@@ -132,10 +130,9 @@ def _misspelt(kind: type, base: type) -> str:
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
             # the cutoff takes `load` for `loads`, but not `contact_arm` for `contacts`
-            near = near or difflib.get_close_matches(
-                name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=0.85
-            )
-            # beside the real one it is a helper
+            meant = (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES
+            near = near or difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
+            # beside a method of the right name it is a helper
             if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):
                 what = "a method" if callable_ else "an attribute"
                 return (
@@ -146,16 +143,10 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """Raise ValueError for a count that is no static field: it would be traced, and loops and branches over
-    it would fail.
-    """
+    """Raise ValueError for a count that is not a static field: loops over a traced number fail."""
     for field in fields(scene):
-        value = getattr(scene, field.name)
-        if (
-            isinstance(value, int)
-            and not field.metadata.get("static")
-            and not field.metadata.get("parameter")
-        ):
+        value, known = getattr(scene, field.name), field.metadata
+        if isinstance(value, int) and not known.get("static") and not known.get("parameter"):
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is {value}, which is not a parameter; for "
                 f"a count or switch write `{field.name}: {type(value).__name__} = eqx.field(static=True, "

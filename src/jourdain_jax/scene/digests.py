@@ -1,10 +1,10 @@
-"""Digests that identify studies, equal in every process: of numbers, texts, containers, scenes and functions.
+"""Digests of numbers, texts, containers, scenes and functions. They are equal in every process and identify
+studies, so a changed function makes another study.
 
 A user's function enters by its code (byte code, constants, names), default arguments, closed-over values, and
 the globals that its code names, also in the user's modules. A function or class of an installed package or of
-this one enters by its name, since the study stores their versions. If it was made by a wrapper (as by
-`jax.grad`), its closed-over values enter too. So a changed function makes another study. Other objects enter
-by their pickled content.
+this one enters by its name, since the study stores the versions. Closed-over values of a function from a
+wrapper, such as `jax.grad`, enter too. Other objects enter by their pickled content.
 """
 
 import copyreg
@@ -33,7 +33,7 @@ def _hashed(content: object) -> str:
 def _content(
     x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]
 ) -> object:
-    """Return the content for a digest. `within`: the enclosing objects; `known`: memo of digests."""
+    """Return the content of x for a digest. `within`: ids of enclosing objects; `known`: known digests."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -90,8 +90,8 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Return whether it is a SymPy expression. These are identified by their text, since SymPy numbers
-    symbols differently in every process.
+    """Return whether x is a SymPy expression. Its digest is of its text, since SymPy numbers symbols
+    differently in every process.
     """
     sympy = sys.modules.get("sympy")
     return sympy is not None and isinstance(
@@ -107,24 +107,20 @@ def _pickled(x: object) -> object:
         kept = copyreg.dispatch_table[type(x)](x) if type(x) in copyreg.dispatch_table else x.__reduce_ex__(4)
     except Exception:  # the methods of any object may raise anything
         return None
-    return (
-        kept
-        if isinstance(kept, str)
-        else tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
-    )
+    if isinstance(kept, str):
+        return kept
+    return tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
 
 
 def _function(f: FunctionType, of) -> object:
-    installed, name = (
-        is_installed(f.__globals__.get("__name__")),
-        (f.__module__, f.__qualname__, f.__code__.co_qualname),
-    )
+    installed = is_installed(f.__globals__.get("__name__"))
+    name = f.__module__, f.__qualname__, f.__code__.co_qualname
     if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
         return "function", name
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the content of a name's value; for a user's module, of the attributes that the code names."""
+        """Return the content of a name's value; of a user's module, the attributes that the code names."""
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))

@@ -1,9 +1,9 @@
-"""Caches keyed by scene: by class, names read by its methods (`outside_names.py`) and shapes of parameters,
-or also by values.
+"""Caches keyed by scene: by its class, the names that its methods read (`outside_names.py`) and the shapes of
+its parameters, or also by their values.
 
-Reference parameters replace traced parameters by numbers. Facts that hold at every state of a scene, such as
-rank and independent speeds, must be known before compilation. They are found by evaluating the scene at a few
-states, with numbers for its parameters.
+Facts that hold at every state of a scene, such as rank and independent speeds, must be known before
+compilation. They are found at a few states, with numbers for the parameters. Reference parameters are the
+numbers for traced parameters.
 """
 
 import sys
@@ -30,7 +30,7 @@ def clear_caches() -> None:
 
     Every scene is traced, probed and compiled again at its next use. Call this after changing values in
     helper functions, modules or classes. Machine code is kept: it depends only on the text of its program,
-    and another thread may be running it.
+    and another thread may run it.
     """
     for name, module in list(sys.modules.items()):
         if name.startswith("jourdain_jax.") and ".native" not in name:
@@ -42,10 +42,10 @@ def clear_caches() -> None:
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """Decorate a function of a scene (and of further keys) to run once per class and values, on concrete
+    """Decorate a function of a scene and further keys to run once per class and values, on concrete
     parameters, even during tracing.
 
-    `of_traced`: a function called instead, without caching, for scenes with traced parameters.
+    `of_traced`: a function that is called for scenes with traced parameters, without caching.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -95,11 +95,8 @@ _latest: list[Values] = []
 def _asked_about_before(leaves: list, treedef) -> Values | None:
     """Return the key of the latest scene if its leaves are these objects."""
     for known in _latest:
-        if (
-            len(known.leaves) == len(leaves)
-            and all(map(is_, known.leaves, leaves))
-            and known.structure == (treedef, jax.config.jax_enable_x64)
-        ):
+        same = len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves))
+        if same and known.structure == (treedef, jax.config.jax_enable_x64):
             return known
     return None
 
@@ -113,7 +110,7 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
     """Return a context in which known numbers of `scene` replace traced parameters of its class.
 
-    Parameters that are `varied` (names; None: all) are replaced by generic numbers near the scene's.
+    `varied`: names of parameters (None: all) for which generic numbers near the scene's are used.
     """
     token = _STAND_IN.set((scene, varied))
     try:
@@ -123,11 +120,11 @@ def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterat
 
 
 def with_reference_parameters(scene):
-    """Return the scene with numbers in place of traced parameters: generic ones near the reference, the
-    class's defaults, or one.
+    """Return the scene with generic numbers in place of traced parameters: near the reference, near the
+    class's defaults, or near one.
 
-    Generic numbers keep a default of zero (a tilt, a rate) from hiding a term, and two equal defaults from
-    counting as one length.
+    With generic numbers, a default of zero (a tilt, a rate) hides no term, and two equal defaults are two
+    lengths.
     """
     leaves, treedef = jax.tree.flatten(scene)
     unknown = [is_traced_type(type(x)) for x in leaves]
@@ -175,11 +172,11 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return the given numbers changed by the fractions `change`: the shape of `given`, after any leading
-    axes. A number that is 0 becomes the argument `zero`.
+    """Return the numbers `given`, changed by the fractions `change`, which may have leading axes. A number
+    that is 0 counts as `zero`.
 
-    An inertia tensor becomes the tensor of the body stretched, sheared and rotated, since separately changed
-    entries may belong to no body:
+    Separately changed entries of an inertia tensor I may belong to no body. I becomes the tensor of the body,
+    stretched, sheared and rotated by a small matrix E:
 
         S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
     """
@@ -199,21 +196,18 @@ def _is_inertia(x: np.ndarray) -> bool:
     """Return whether the array may be an inertia tensor and is not a rotation matrix. The tolerance is one
     per cent, the accuracy of published moments.
     """
-    if (
-        x.shape != (3, 3)
-        or not np.any(x)
-        or np.any(np.abs(x - x.T) > 1e-9 * largest(x))
-        or np.allclose(x @ x.T, np.eye(3))
-    ):
+    if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)):
+        return False
+    if np.allclose(x @ x.T, np.eye(3)):
         return False
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
 
 
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
-    """Decorate a function of a scene (and of further keys) that depends only on its class and the shapes of
-    its parameters, to run once.
+    """Decorate a function of a scene and further keys to run once per class and shapes of the parameters, on
+    which alone it depends.
 
-    `most`: the number of stored results.
+    `most`: maximum number of stored results.
     """
     known: dict = {}
     keeping = Lock()  # two threads may compute the same result
@@ -239,9 +233,7 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Return a context that uses stored results of these functions, keyed by function name and first further
-    key.
-    """
+    """Return a context with stored results of decorated functions, by function name and first further key."""
     token = _BEFORE.set(found)
     try:
         yield

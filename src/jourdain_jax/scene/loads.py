@@ -1,8 +1,9 @@
 """Impressed forces: known functions of time, state and parameters, as resultants on bodies or on speeds.
 
-A load acts on the mass centres (`forces`), as torques (`torques`), or directly on generalized speeds
-(`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a `potential`
-is conservative and counts in the potential energy V; the work of the others is integrated along the motion.
+A load has forces F at the mass centres (`forces`), torques L (`torques`), and generalized forces Q_k on the
+speeds u_k (`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a
+`potential` is conservative and counts in the potential energy V. The work of other loads is integrated along
+the motion.
 """
 
 from typing import Any
@@ -22,8 +23,8 @@ class Load(eqx.Module):
     - `forces`: body -> (3,) in N, inertial frame, at the mass centre; `torques`: body -> (3,) in N m,
       inertial frame, about the mass centre.
     - `generalized`: speed -> force on it, in N or N m.
-    - `potential` in J, whose negative gradient is the force (`verify` checks this). None: not conservative,
-      and its work is integrated along the motion.
+    - `potential` in J, whose negative gradient is the force (`verify` checks this). None: the load is not
+      conservative, and its work is integrated along the motion.
     """
 
     forces: dict[str, Vector3]  # N, inertial frame, at the mass centre
@@ -61,8 +62,8 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
 def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) -> Load:
     """Return uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
-    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. A direction of another length
-    is refused when the scene is built.
+    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. Raises ValueError for a
+    direction of another length when the scene is built.
     """
     motion = _motion(motion, "gravity")
     e = checked_real(direction, "direction of gravity", (3,), advice="give a unit vector")
@@ -77,15 +78,8 @@ def point_force(point: Point, force: Any) -> Load:
     `motion["body"].point(local)`; no potential.
     """
     point = _as_point(point, "point of a force")
-    return _on_point(
-        point,
-        checked_real(
-            force,
-            f"force on a point of `{point.body}`",
-            (3,),
-            advice="give three components in the inertial frame, N",
-        ),
-    )
+    advice = "give three components in the inertial frame, N"
+    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice=advice))
 
 
 def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = None) -> Load:
@@ -110,10 +104,8 @@ def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
     in m.
     """
     apart, length, direction = _line(a, b, "spring")
-    stiffness, rest_length = (
-        checked_real(stiffness, "stiffness of a spring", ()),
-        checked_real(rest_length, "rest length of a spring", ()),
-    )
+    stiffness = checked_real(stiffness, "stiffness of a spring", ())
+    rest_length = checked_real(rest_length, "rest length of a spring", ())
     extension = length - rest_length
     # k (l - l0) e, written so that a spring of zero rest length is smooth where its ends meet
     pull = stiffness * (apart - rest_length * direction)
@@ -138,11 +130,8 @@ def generalized_force(motion: Motion, **forces: Any) -> Load:
     """
     motion = _motion(motion, "generalized_force")
     check_names(forces, motion.u.keys(), "generalized force on unknown speed `{}`")
-    return Load(
-        generalized={
-            name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()
-        }
-    )
+    found = {name: checked_real(x, f"generalized force on `{name}`", ()) for name, x in forces.items()}
+    return Load(generalized=found)
 
 
 def _motion(motion: Motion, what: str) -> Motion:
@@ -169,9 +158,9 @@ def _line(a: Point, b: Point, what: str):
 
 
 def _on_point(point: Point, force) -> Load:
-    return (
-        Load() if point.body is None else Load({point.body: force}, {point.body: jnp.cross(point.arm, force)})
-    )
+    if point.body is None:
+        return Load()
+    return Load({point.body: force}, {point.body: jnp.cross(point.arm, force)})
 
 
 def _between(a: Point, b: Point, pull, potential) -> Load:

@@ -1,10 +1,10 @@
-"""Modes, which are inputs switched by events, and events at which the motion continues, possibly with a jump
-of the state.
+"""Modes, which are inputs that events switch, and events after which the motion continues, with or without a
+jump of the state.
 
-    t_e:  c(t, q, u) falls through zero      (q, u) <- R(t, q, u),   mode <- another one
+    at the time t_e when c(t, q, u) falls through zero:      (q, u) <- R(t, q, u),   mode <- its next value
 
-Between events a mode is a constant number: the index of its value in the scene's list. Source of the
-derivatives: `integrate/loop/transitions.py`.
+Between events a mode is a constant number: the index of its value in the scene's list. Derivatives across
+events are in `integrate/loop/transitions.py`.
 """
 
 from collections.abc import Mapping
@@ -33,8 +33,8 @@ class Modes:
         return tuple(name for name, _ in self.pairs)
 
     def number(self, name: str, value, where: str):
-        """Return the number of a mode's value, given by name or number. Raises ValueError if there is none.
-        `where`: the origin of the value, for the message.
+        """Return the number of a mode's value, given by name or number. Raises ValueError for an unknown
+        value. `where`: the origin of the value, for the message.
         """
         names = self.values[name]
         if isinstance(value, str):
@@ -61,11 +61,8 @@ def modes(**values) -> Modes:
     **Raises** ValueError for fewer than two values, or values that are not texts.
     """
     for name, of_mode in values.items():
-        if (
-            isinstance(of_mode, str)
-            or not all(isinstance(value, str) for value in of_mode)
-            or len(set(of_mode)) < 2
-        ):
+        texts = not isinstance(of_mode, str) and all(isinstance(value, str) for value in of_mode)
+        if not texts or len(set(of_mode)) < 2:
             raise ValueError(
                 f"mode `{name}` has the values {of_mode!r}, expected two names or more: "
                 f"jj.modes({name}=('open', 'closed'))"
@@ -75,14 +72,15 @@ def modes(**values) -> Modes:
 
 @dataclass(frozen=True)
 class Event:
-    """An event at which the motion continues. `events` returns it in place of a plain value.
+    """An event after which the motion continues. `events` returns it in place of a plain value.
 
-    - `value`: the event occurs where it falls through zero. A smooth dip of an event narrower than the
-      longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less than
-      that. Use values that fall only once, or a smaller `max_step`.
+    - `value`: the event occurs where it falls through zero. A value that is negative for less than the
+    longest
+      step may be missed; so may a condition such as `jnp.linalg.norm(x) < r` that holds as shortly. Use
+      values that fall only once, or a smaller `max_step`.
     - `to`: mode -> name of its value afterwards.
-    - `jump`: coordinate or speed -> its value afterwards; all others keep theirs. The new state must satisfy
-      the velocity constraints.
+    - `jump`: coordinate or speed -> its value afterwards; the other ones do not jump. The new state must
+      satisfy the velocity constraints.
     - `stop`: whether the motion ends here, as at a plain value.
 
     **Examples**

@@ -21,7 +21,7 @@ Vectors = Float[Array, "*times 3"]
 
 
 class Point(eqx.Module):
-    """A point of a body (or of the inertial frame, `body` None), with its position and velocity."""
+    """A point of a body, with its position and velocity. `body` is None for a point of the inertial frame."""
 
     position: Vectors  # m, inertial frame
     velocity: Vectors  # m/s, inertial frame
@@ -107,7 +107,7 @@ class BodyMotion(eqx.Module):
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
     def rate_of_pose(self) -> BodyPose:
-        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`, with constant mass and inertia."""
+        """Return the rate of the pose, per s: `rdot = v`, `Rdot = [omega]x R`, with constant mass."""
         rate = eqx.tree_at(lambda b: b.position, jax.tree.map(jnp.zeros_like, self.body), self.velocity)
         if isinstance(rate, RigidBody):
             rate = eqx.tree_at(lambda b: b.orientation, rate, skew(self.angular_velocity) @ self.orientation)
@@ -148,7 +148,7 @@ class Motion(eqx.Module):
 
     @property
     def modes(self) -> Named:
-        """Return the inputs under the name used for modes; each mode is the number of its value."""
+        """Return the inputs, among them the modes. A mode is the number of its value."""
         return self.inputs
 
     def pose(self) -> Pose:

@@ -11,7 +11,7 @@ Sentences = tuple[str, ...]  # messages to the user
 
 
 class UnknownNameError(KeyError):
-    """A name that does not exist. Unlike a plain KeyError, it prints its message without quotes."""
+    """Raised for a name that does not exist; unlike KeyError, it prints its message without quotes."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
@@ -47,9 +47,7 @@ def as_names(names: "str | Iterable[str]") -> Labels:
 
 
 def as_labels(labels: "str | Iterable[str]") -> Labels:
-    """Return names of another tool as a tuple. A text counts as one name, since such names may contain
-    blanks.
-    """
+    """Return names of another tool as a tuple. A text is one name, since such names may contain blanks."""
     return (labels,) if isinstance(labels, str) else as_names(labels)
 
 
@@ -57,9 +55,8 @@ class Named(eqx.Module):
     """A flat array with access by name to entries and groups of entries: `q.yaw`, `q["yaw"]`, `q.array`."""
 
     array: Float[Array, "*shape"]
-    slots: tuple[tuple[str, int, int], ...] = eqx.field(
-        static=True
-    )  # name, first entry, length (0 for a scalar)
+    # name, first entry, length (0 for a scalar)
+    slots: tuple[tuple[str, int, int], ...] = eqx.field(static=True)
 
     def __getitem__(self, name: str):
         for slot, first, length in self.slots:

@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, all_finite, as_real, described, ha
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array. Values that cannot be converted stay unchanged;
-    `check_parameters`, which knows the field's name, refuses them.
+    """Return a parameter as a floating-point array. Other values stay unchanged, and `check_parameters`
+    refuses them with the field's name.
     """
     try:
         return as_real(value)
@@ -29,24 +29,14 @@ def parameter(
     differentiable.
 
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
-    - `positive`, `non_negative`: raise ValueError for other signs when a scene is made with known values.
-      Numbers that are not finite are always refused.
+    - `positive`, `non_negative`: required sign. A scene with a known value of another sign, or with numbers
+      that are not finite, raises ValueError.
     """
-    options = (
-        {}
-        if default is ...
-        else {"default": default}
-        if np.ndim(default) == 0
-        else {"default_factory": lambda: default}
-    )
-    metadata = {
-        "parameter": True,
-        "unit": unit,
-        "positive": positive,
-        "non_negative": non_negative,
-        "about": about,
-    }
-    return eqx.field(converter=_as_leaf, metadata=metadata, **options)
+    whole = np.ndim(default) == 0
+    options = {"default": default} if whole else {"default_factory": lambda: default}
+    metadata = {"parameter": True, "unit": unit, "about": about}
+    metadata |= {"positive": positive, "non_negative": non_negative}
+    return eqx.field(converter=_as_leaf, metadata=metadata, **({} if default is ... else options))
 
 
 def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
@@ -57,8 +47,8 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
 
 
 def parameter_faults(scene) -> dict[str, Flag]:
-    """Return for each parameter whether it is not finite or has the wrong sign. Unlike `check_parameters`,
-    works under jit and vmap.
+    """Return for each parameter whether it is not finite or has the wrong sign. This works under jit and
+    vmap, unlike `check_parameters`.
     """
     faults = {}
     for name, value, metadata in parameters_of(scene):
@@ -99,8 +89,8 @@ def check_parameters(scene) -> None:
 
 
 def stacked_parameters(scene) -> str:
-    """Return a sentence on parameters with one axis more than their defaults, as in a batch of scenes; empty
-    if there are none.
+    """Return a sentence about parameters with one axis more than their defaults, as in a batch of scenes.
+    Without such parameters it is empty.
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}

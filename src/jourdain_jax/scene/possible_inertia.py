@@ -1,12 +1,12 @@
-"""Possible moments of inertia, parametrised by unconstrained numbers: positive definite, each principal
-moment at most the sum of the other two.
+"""Possible moments of inertia as functions of unconstrained numbers d, s. The matrix I is positive definite,
+and each principal moment is at most the sum of the other two.
 
     I = tr(S) 1 - S,      S = A A'       A = [exp(d1) s12 s13; 0 exp(d2) s23; 0 0 exp(d3)]
 
-S is the second moment of the mass about the mass centre, positive definite for every body that is not flat; A
-is its Cholesky factor, upper triangular. It is the block of the body's pseudo-inertia about the mass centre,
-independent of mass and mass centre. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters
-7 (2022) 2700, eqs. (10)-(13).
+S is the second moment of the mass about the mass centre, positive definite for every body that is not flat. A
+is its upper triangular Cholesky factor. S does not depend on mass and mass centre: it is their block of the
+body's pseudo-inertia. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022)
+2700, eqs. (10)-(13).
 """
 
 import jax.numpy as jnp
@@ -18,18 +18,21 @@ from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, la
 
 def inertia_from_log_cholesky(numbers) -> Matrix3:
     """Return an inertia matrix (3, 3) about the mass centre, in kg m^2, that is physically possible for all
-    `numbers`.
+    `numbers`. It is differentiable at all numbers.
 
-    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13): d are the logarithms of the diagonal entries of a
-    triangular factor, s its other entries, in sqrt(kg) m. For a body that is symmetric about its x-z plane,
-    where Ixy = Iyz = 0: (d1, d2, d3, s13).
+    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13), of a triangular factor in sqrt(kg) m: the
+    logarithms d of its diagonal entries, and its other entries s. For a body that is symmetric about its x-z
+    plane, where Ixy = Iyz = 0: (d1, d2, d3, s13).
+
+        moments = jj.identification.log_cholesky([0.5, 1.0, 0.7])
 
         class Frame(jj.Scene):
-            inertia: jax.Array = jj.parameter(jj.identification.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit
+            inertia: jax.Array = jj.parameter(moments)  # free={"inertia"} in a fit
             ...
-                jj.RigidBody(self.mass, jj.identification.inertia_from_log_cholesky(self.inertia), position, orientation)
+                inertia = jj.identification.inertia_from_log_cholesky(self.inertia)
+                jj.RigidBody(self.mass, inertia, position, orientation)
 
-    **Raises** ValueError for another shape. Differentiable at all numbers.
+    **Raises** ValueError for another shape.
     """
     numbers = checked_real(
         numbers,
@@ -51,12 +54,12 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
 
 
 def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]:
-    """Return the numbers (6,) from which `inertia_from_log_cholesky` computes this inertia matrix: (3, 3) or
-    three principal moments, kg m^2, about the mass centre.
+    """Return the numbers (6,) from which `inertia_from_log_cholesky` computes this `inertia`: a matrix (3, 3)
+    or three principal moments, in kg m^2, about the mass centre.
 
     `symmetric`: return four numbers, for a body that is symmetric about its x-z plane. **Raises** ValueError
-    for another shape, an asymmetric matrix, nonzero Ixy or Iyz with `symmetric`, and moments that no body of
-    nonzero thickness has. Traced matrices give NaN instead.
+    for another shape, an asymmetric matrix, nonzero Ixy or Iyz with `symmetric`, and moments of a flat or
+    impossible body. Traced matrices give NaN instead.
     """
     I = checked_real(
         inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal moments, kg m^2"
@@ -88,6 +91,6 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
             f"no body of nonzero thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg "
-            "m^2 (`inertia` of `log_cholesky`): each must be positive and less than the sum of the other "
+            "m^2 (`inertia` of `log_cholesky`), expected positive ones, each less than the sum of the other "
             "two; for a flat body, reduce the largest slightly"
         )

@@ -1,5 +1,5 @@
-"""Text of results in a console and in a notebook, with shapes in place of traced values; tables and matrices
-as text.
+"""Text of results in a console and in a notebook: numbers, tables and matrices. Shapes stand for traced
+values.
 """
 
 import dataclasses
@@ -53,11 +53,8 @@ def scene_text(scene) -> str:
             text = _value(value)
             text = f"[{text}]" if ", " in text else text
         else:
-            text = (
-                repr(value)
-                if value is None or isinstance(value, bool | int | float | str)
-                else type(value).__name__
-            )
+            plain = value is None or isinstance(value, bool | int | float | str)
+            text = repr(value) if plain else type(value).__name__
         shown.append(f"{field.name}={text}")
     return f"{type(scene).__name__}({', '.join(shown)})"
 
@@ -70,16 +67,13 @@ def scene_html(scene) -> str:
     cell = lambda text: f"<td {left}>{html.escape(text)}</td>"
     about = (type(scene).__doc__ or "").strip().split("\n")[0]
     rows = [
-        "<tr><th"
-        f" {left}>{html.escape(name)}</th>{cell(_value(value))}{cell(known['unit'])}{cell(known['about'])}</tr>"
+        f"<tr><th {left}>{html.escape(name)}</th>"
+        f"{cell(_value(value))}{cell(known['unit'])}{cell(known['about'])}</tr>"
         for name, value, known in parameters_of(scene)
     ]
     heads = "".join(f"<th {left}>{head}</th>" for head in ("parameter", "value", "unit", ""))
-    listed = (
-        ("coordinates", scene.coordinate_names),
-        ("speeds", scene.speed_names),
-        ("inputs", scene.inputs),
-    )
+    own = scene.coordinate_names, scene.speed_names, scene.inputs
+    listed = zip(("coordinates", "speeds", "inputs"), own, strict=True)
     names = "".join(
         f"<div>{what}: {html.escape(', '.join(given.entries))}</div>"
         for what, given in listed
@@ -95,19 +89,13 @@ def scene_html(scene) -> str:
 def _value(value) -> str:
     if is_traced(value):
         return "being traced"
-    return (
-        f"{float(value):.6g}"
-        if value.ndim == 0
-        else (
-            f"array of shape {value.shape}"
-            if value.size > 6
-            else ", ".join(f"{x:.6g}" for x in value.ravel())
-        )
-    )
+    if value.size > 6:
+        return f"array of shape {value.shape}"
+    return ", ".join(f"{float(x):.6g}" for x in value.ravel())
 
 
 def in_digits(values) -> list[str]:
-    """Return numbers with six digits; numbers below the round-off of the largest become 0."""
+    """Return texts of numbers with six digits. Numbers below the round-off of the largest become 0."""
     values = np.asarray(values)
     least = eps_of(values) * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]

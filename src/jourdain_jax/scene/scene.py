@@ -1,6 +1,8 @@
-"""The scene: a module whose fields are physical parameters and whose methods describe bodies, loads and
-constraints in plain JAX. Velocities, partial velocities, the mass matrix and the constraint rows follow by
-automatic differentiation.
+"""The scene: its fields are physical parameters, its methods describe bodies, loads and constraints in plain
+JAX.
+
+Velocities, partial velocities, the mass matrix and the constraint Jacobian follow by automatic
+differentiation.
 """
 
 import inspect
@@ -66,11 +68,11 @@ class Scene(eqx.Module):
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
     As everywhere in JAX, methods are traced once, and values from outside the fields of the scene become
-    constants. Some may change: numbers, texts, tuples of them, and functions that a method itself reads as
-    global names or as variables of an enclosing function. The next call notices the change, as it notices a
-    replaced method or code changed by `%autoreload`. Arrays, lists, dictionaries and objects with state raise
-    an error; make them parameters or static fields. Call `jj.clear_caches()` after other changes: values that
-    helper functions read, attributes of modules and classes, and files.
+    constants. A method may itself read global names and variables of an enclosing function. If they hold
+    numbers, texts, tuples of these or functions, the next call notices a change, also of a method or by
+    `%autoreload`. If they hold arrays, lists, dictionaries or objects with state, the scene raises an error;
+    make them parameters or static fields. Call `jj.clear_caches()` after other changes: of values that helper
+    functions read, of attributes of modules and classes, and of files.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -142,17 +144,17 @@ class Scene(eqx.Module):
         return None
 
     def gauge(self, pose: Pose) -> Scalar | None:
-        """Return a function S (J s) of a `pose` whose rate is subtracted from the Lagrangian, L = T - V -
-        dS/dt; None if there is none.
+        """Return a function S (J s) of a `pose`, or None. Its rate is subtracted from the Lagrangian:
+        L = T - V - dS/dt.
 
-        The motion is independent of S, but integrators built on a discrete Lagrangian are not. S shows how
-        much their accuracy depends on the choice of L.
+        The motion does not depend on S, but the error of integrators with a discrete Lagrangian does. S shows
+        how much.
         """
         return None
 
     def prescribed(self, t: Scalar) -> Mapping[str, Scalar]:
-        """Return prescribed coordinates as functions of time, name -> value. The multiplier of the constraint
-        is the force of the actuator.
+        """Return prescribed coordinates at time t (s), name -> value. The multiplier of such a constraint is
+        the force of the actuator.
         """
         return {}
 
@@ -177,19 +179,17 @@ class Scene(eqx.Module):
         motion stops where a value falls through zero; beyond that the value may be NaN. A value that starts
         at zero and rises is no event. Return a `jj.Event` instead of a value to let the motion continue.
 
-        The first of several events in one step counts. A value that falls through zero and rises again within
-        one step is found if a relation in it (`<`, `where`, `abs`, ...) changes. It is also found if the fall
-        shows in the cubic through values and rates at the ends of the step (default solvers), or in the dense
-        output at three times in the step (other adaptive solvers). A smooth dip of an event narrower than the
-        longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less
-        than that. Use values that fall only once, or a smaller `max_step`.
+        The first of several events in one step counts. A value may fall through zero and rise again within
+        one step. Such an event is found if a relation in it (`<`, `where`, `abs`, ...) changes. Default
+        solvers also find it if the cubic through values and rates at the ends of the step is negative, other
+        adaptive solvers if the dense output is at one of three times. Otherwise it may be missed, as may a
+        condition such as `jnp.linalg.norm(x) < r` that holds for less than a step. Use values that fall only
+        once, or a smaller `max_step`.
         """
         return {}
 
     def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
-        """Return quantities of a `motion` that this scene conserves besides energy, by name; used in checks
-        and summaries.
-        """
+        """Return conserved quantities of a `motion` besides energy, by name, for checks and summaries."""
         return {}
 
     def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
@@ -214,14 +214,14 @@ class Scene(eqx.Module):
         return scene_text(self)
 
     def _repr_html_(self) -> str:
-        """Return HTML for notebooks: class, parameters with values and units, coordinates, speeds and inputs."""
+        """Return HTML for notebooks: class, parameters with values and units, names of the variables."""
         return scene_html(self)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy of this scene with changed parameters: `changes`, name -> value in the parameter's
+        """Return a copy of this scene with changed parameters. `changes`: name -> value in the parameter's
         unit.
 
-        Raises ValueError for an unknown name (with the nearest valid one) or an inadmissible value.
+        Raises ValueError for an inadmissible value, and for an unknown name with the nearest valid one.
         """
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:
@@ -232,11 +232,11 @@ class Scene(eqx.Module):
         return replace(self, **changes)
 
     def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
-        """Return q and u with the named `values`, and the given names. Other entries are at the reference:
-        zero, or the identity for quaternions.
+        """Return q and u with the named `values`, and the given names. Other entries have their reference
+        value: zero, or the identity for quaternions.
 
-        A quaternion or its angular velocity may be given as a whole, by its own name. If a quaternion is
-        given in part, its other parts are zero. Raises ValueError for an unknown name, a wrong shape, or
+        A quaternion or its angular velocity may be given as a whole, by its own name. If some parts of a
+        quaternion are given, the others are zero. Raises ValueError for an unknown name, a wrong shape, or
         parts of a quaternion whose squares do not sum to one.
         """
         q, u, given = vectors_named(self, values)
@@ -323,7 +323,7 @@ def _vector(entries: list) -> Float[Entries, "entries"]:
 
 
 def _names_read(kind: type[Scene], *functions: Callable) -> NamesRead:
-    """Return the names that the functions, and the methods of the scene's own classes, read."""
+    """Return the names that the methods of the scene's own classes and the functions read."""
     return names_read(*(owner for owner in kind.__mro__ if owner not in Scene.__mro__), *functions)
 
 
@@ -343,8 +343,7 @@ class HeldFunction(eqx.Module):
 
 
 def hold_leaves(scene) -> None:
-    """Make the functions in the fields of a new scene static, at any depth, and convert floats to arrays, as
-    for parameters.
+    """Make functions in the fields of a new scene static, at any depth, and convert floats to arrays.
 
     Raises ValueError for texts, which only a static field can hold.
     """

@@ -7,8 +7,7 @@ On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second d
     h_k-1 m_k-1 + 2 (h_k-1 + h_k) m_k + h_k m_k+1 = 6 ((v_k+1 - v_k)/h_k - (v_k - v_k-1)/h_k-1)
 
 The third derivative is continuous at the second and the last but one knot ("not a knot"). A piecewise linear
-curve would not do: its second derivative is zero between knots, so a motion along it would have no inertia
-force.
+curve is no substitute: its second derivative is zero between knots, so its motion has no inertia force.
 """
 
 import equinox as eqx
@@ -35,8 +34,9 @@ class Spline(eqx.Module):
     - `ts`: knots, s, increasing; `values`: one number per knot. Two of them give a line, three a parabola,
       more a cubic spline.
 
-    It is differentiable with respect to `values` and `ts`, and can be a field of a scene, be made in its
-    methods, or be an input. For samples of a smooth motion at intervals h its error is of order h^4.
+    It is differentiable with respect to `values` and `ts`. It can be a field of a scene, a value in its
+    methods, or an input. For samples of a smooth motion at intervals h its error is of order h^4.
+
     **Raises** ValueError for other shapes, times that do not increase, or numbers that are not finite.
     """
 
@@ -68,7 +68,7 @@ def checked_samples(
     if not (all_finite(knots) and np.all(np.diff(knots) > 0)):
         raise ValueError(
             f"the times of `{kind}` must be finite and increase from one to the next; sort the "
-            "samples by time and merge repeated ones"
+            "samples by time and merge samples of equal time"
         )
     if not all_finite(numbers):
         first = int(np.argmin(np.isfinite(numbers)))
@@ -100,9 +100,7 @@ def _second_derivatives(ts, values) -> Float[Array, "samples"]:
     # m_0 = (1 + first) m_1 - first m_2, and likewise at the other end
     first, last = h[0] / h[1], h[-1] / h[-2]
     middle = (2 * (h[:-1] + h[1:])).at[0].add(h[0] * (1 + first)).at[-1].add(h[-1] * (1 + last))
-    below, above = (
-        h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last),
-        h[1:].at[-1].set(0.0).at[0].add(-h[0] * first),
-    )
+    below = h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last)
+    above = h[1:].at[-1].set(0.0).at[0].add(-h[0] * first)
     m = jax.lax.linalg.tridiagonal_solve(below, middle, above, bends[:, None])[:, 0]
     return jnp.concatenate([(1 + first) * m[:1] - first * m[1:2], m, (1 + last) * m[-1:] - last * m[-2:-1]])

@@ -44,7 +44,7 @@ def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "co
     names = scene.coordinate_names.entries[: len(scene.coordinate_names) - directions]
     rates = checked_real(
         scene.coordinate_rates(t, q, u),
-        f"what `coordinate_rates` of `{_name(scene)}` returned",
+        f"the result of `coordinate_rates` of `{_name(scene)}`",
         (len(names),),
         advice=f"return one rate for each of {', '.join(names)}, in this order, such as jnp.stack([...])",
     )
@@ -54,19 +54,13 @@ def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "co
 def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
     """Return the loads of a scene; a single load becomes a tuple of one."""
     given = scene.loads(motion)
-    loads = (
-        (given,)
-        if isinstance(given, Load)
-        else tuple(given)
-        if isinstance(given, Iterable) and not isinstance(given, dict | str)
-        else None
-    )
-    if loads is None:
+    given = (given,) if isinstance(given, Load) else given
+    if not isinstance(given, Iterable) or isinstance(given, dict | str):
         raise ValueError(
             f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of "
             "loads; write return (jj.gravity(motion, 9.81),)"
         )
-    return tuple(_checked_load(scene, i, load) for i, load in enumerate(loads))
+    return tuple(_checked_load(scene, i, load) for i, load in enumerate(given))
 
 
 def _checked_load(scene: Scene, i: int, load) -> Load:
@@ -99,26 +93,14 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
 
 def potential_of(scene: Scene, pose: Pose) -> Scalar | None:
     """Return the scene's own potential energy, J; None if there is none."""
-    V = scene.potential(pose)
-    return (
-        None
-        if V is None
-        else checked_real(
-            V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None"
-        )
-    )
+    V, what = scene.potential(pose), f"the result of `potential` of `{_name(scene)}`"
+    return None if V is None else checked_real(V, what, (), advice="return the energy in J, or None")
 
 
 def gauge_of(scene: Scene, pose: Pose) -> Scalar | None:
     """Return the scene's gauge function, J s; None if there is none."""
-    S = scene.gauge(pose)
-    return (
-        None
-        if S is None
-        else checked_real(
-            S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None"
-        )
-    )
+    S, what = scene.gauge(pose), f"the result of `gauge` of `{_name(scene)}`"
+    return None if S is None else checked_real(S, what, (), advice="return a number in J s, or None")
 
 
 def prescribed_of(scene: Scene, t) -> dict[str, Scalar]:
@@ -133,7 +115,7 @@ def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of the scene's own velocity constraints, without those that hold up to a force."""
+    """Return values of the scene's own velocity constraints that hold any force."""
     given = _dictionary(scene, "velocity_constraints", (motion,), '{"edge": value}')
     always = {name: value for name, value in given.items() if not isinstance(value, HeldRow)}
     _declared(scene, given.keys() - always, "velocity_constraints", "holds=")
@@ -182,10 +164,8 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     )
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
-        event, where = (
-            given if isinstance(given, Event) else Event(given, stop=True),
-            f"event `{name}` of `{_name(scene)}`",
-        )
+        event = given if isinstance(given, Event) else Event(given, stop=True)
+        where = f"event `{name}` of `{_name(scene)}`"
         for what, changed in (("to", event.to), ("jump", event.jump)):
             check_kind(changed, Mapping, f"`{what}` of {where}", "a dictionary by name")
         if event.stop and (event.to or event.jump):
@@ -229,13 +209,7 @@ def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
                 f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" '
                 f"(the inertial frame); {nearest(name, pose.bodies)}"
             )
-        found[name] = (
-            (looks,)
-            if isinstance(looks, Visual)
-            else tuple(looks)
-            if isinstance(looks, list | tuple)
-            else (looks,)
-        )
+        found[name] = tuple(looks) if isinstance(looks, list | tuple) else (looks,)
         for look in found[name]:
             if not isinstance(look, Visual):
                 raise ValueError(

@@ -5,6 +5,7 @@ of their contacts, or their inertia.
 """
 
 import os
+import re
 from typing import TypedDict, Unpack
 
 import equinox as eqx
@@ -48,18 +49,17 @@ class Look(TypedDict, total=False):
 
 
 class Visual(eqx.Module):
-    """A shape in the frame of a body, for pictures only. Made by its constructors: `jj.Visual.ball(0.1)`,
-    `wheel`, `box`, `cylinder`, `capsule`, ...
+    """A shape in the frame of a body, for pictures only. Its constructors are `jj.Visual.ball(0.1)`, `wheel`,
+    `box`, `cylinder`, `capsule` and others.
 
-    All of them take
+    All constructors take
 
-    - `at`: (3,) in m, the position of its middle in the body frame, from the mass centre (default: there).
-    - `turn`: (3, 3), from its own axes to the body axes (default: the same axes).
+    - `at`: (3,) in m, the middle of the shape in the body frame (default: the mass centre).
+    - `turn`: (3, 3), from the axes of the shape to the body axes (default: the same axes).
     - `colour`: "#rrggbb" (default: the body's, from a palette). `opacity`: 0 to 1.
 
     Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Positions, rotations and the
-    points of lines may change with the pose; sizes are taken at the first saved time. Raises ValueError for
-    anything but a shape.
+    points of lines may change with the pose; sizes are taken at the first saved time.
 
     **Examples**
 
@@ -69,8 +69,8 @@ class Visual(eqx.Module):
     """
 
     kind: str = static()  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
-    # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule
-    # without its ends), line: points, mesh: factors
+    # m; semi-axes of an ellipsoid, sides of a box, points of a line, factors of a mesh; of a wheel, cylinder
+    # or capsule the radius and the length along z, without the ends of the capsule
     size: Float[Array, "*size"]
     position: Vector3  # m, body frame
     orientation: Matrix3  # own components to body components
@@ -81,7 +81,7 @@ class Visual(eqx.Module):
 
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":
-        """Return a ball of the given `radius` (m), its octants in alternating colours to show its rotation;
+        """Return a ball of the given `radius` (m). Its octants alternate in colour, which shows rotation.
         `look`: as for all shapes.
         """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
@@ -93,16 +93,12 @@ class Visual(eqx.Module):
 
     @staticmethod
     def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
-        """Return a wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis`
-        ("x", "y" or "z"), its quarters in alternating colours. `look`: as for all shapes.
+        """Return a wheel or disc of `radius` and `width` (m; default: a sixth of the radius) about `axis`
+        ("x", "y" or "z"). Its quarters alternate in colour. `look`: as for all shapes.
         """
         radius = _lengths(radius, "radius of a wheel", ())
-        return _about(
-            axis,
-            "wheel",
-            [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())],
-            **look,
-        )
+        width = radius / 6 if width is None else _lengths(width, "width of a wheel", ())
+        return _about(axis, "wheel", [radius, width], **look)
 
     @staticmethod
     def box(sides, **look: Unpack[Look]) -> "Visual":
@@ -114,59 +110,45 @@ class Visual(eqx.Module):
         """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all
         shapes.
         """
-        return _about(
-            axis,
-            "cylinder",
-            [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())],
-            **look,
-        )
+        radius = _lengths(radius, "radius of a cylinder", ())
+        return _about(axis, "cylinder", [radius, _lengths(length, "length of a cylinder", ())], **look)
 
     @staticmethod
     def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
         """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as
         for all shapes.
         """
-        return _about(
-            axis,
-            "capsule",
-            [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())],
-            **look,
-        )
+        radius = _lengths(radius, "radius of a capsule", ())
+        return _about(axis, "capsule", [radius, _lengths(length, "length of a capsule", ())], **look)
 
     @staticmethod
     def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
-        """Return a bar of round section from each of the `points` (m, body frame) to the next; `radius` in m
-        (default: thin); `colour`, `opacity` as for all.
+        """Return a bar of round section from each of the `points` (m, body frame) to the next.
+
+        `radius` in m (default: thin); `colour`, `opacity` as for all shapes.
         """
         if len(points) < 2:
             raise ValueError(
-                f"a line to be drawn has {len(points)} points, expected at least two; write "
+                f"`jj.Visual.line` got {len(points)} points, expected at least two; write "
                 "jj.Visual.line(a, b)"
             )
-        stacked = jnp.stack(
-            [
-                checked_real(
-                    p, "point of a line to be drawn", (3,), advice="give three components, m"
-                ).astype(float)
-                for p in points
-            ]
-        )
+        what, advice = "point of a line to be drawn", "give three components, m"
+        stacked = jnp.stack([checked_real(p, what, (3,), advice=advice).astype(float) for p in points])
         radius = None if radius is None else _lengths(radius, "radius of a line", ())
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
 
     @staticmethod
     def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
-        """Return a spring between two points `a`, `b` (m, body frame): a wire with this number of `turns` and
-        `radius` (m); `colour`, `opacity` as for all shapes.
+        """Return a spring between two points `a`, `b` (m, body frame): a wire with a number of `turns` and a
+        `radius` (m). `colour`, `opacity` as for all shapes.
         """
         a, b = (
             checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float)
             for p in (a, b)
         )
         radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
-        along = jnp.where(
-            length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0])
-        )
+        direction = (b - a) / jnp.where(length > 0, length, 1.0)
+        along = jnp.where(length > 0, direction, jnp.array([0.0, 0.0, 1.0]))
         share = np.linspace(0.0, 1.0, 12 * turns + 1)[:, None]
         wide = np.clip(np.minimum(share, 1 - share) * 12, 0.0, 1.0)  # straight at both ends
         across = tangents_of(along)
@@ -178,9 +160,9 @@ class Visual(eqx.Module):
     def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """Return a body with flat faces.
 
-        `vertices` (points, 3) in m and `faces`, a list of vertex indices for each, anticlockwise seen from
-        outside, are known numbers; `scale`, one factor or three, may depend on parameters. `look` as for all
-        shapes.
+        `vertices`: (points, 3) in m; `faces`: for each face a list of vertex indices, anticlockwise seen from
+        outside. Both are known numbers. `scale`: one factor or three, which may depend on parameters; `look`:
+        as for all shapes.
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
@@ -189,9 +171,8 @@ class Visual(eqx.Module):
                 f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m"
             )
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
-        if not polygons or any(
-            len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons
-        ):
+        right = lambda face: len(face) >= 3 and min(face) >= 0 and max(face) < len(corners)
+        if not polygons or not all(map(right, polygons)):
             raise ValueError(
                 "faces of a mesh need at least three vertex numbers each, from 0 to "
                 f"{len(corners) - 1}, in order"
@@ -201,11 +182,11 @@ class Visual(eqx.Module):
 
     @staticmethod
     def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
-        """Return the mesh in the file `path`, in a format that `trimesh` reads, such as .stl or .obj, times
-        `scale` (0.001 for millimetres).
+        """Return the mesh in the file `path`, in a format of `trimesh`, such as .stl or .obj.
 
-        `look` as for all shapes. Raises ImportError without `trimesh` (the extra `robots`), and ValueError
-        for a missing file, an unknown format, or a mesh without faces.
+        `scale`: factor, 0.001 for millimetres; `look`: as for all shapes. Raises ImportError without
+        `trimesh` (the extra `robots`), and ValueError for a missing file, an unknown format, or a mesh
+        without faces.
         """
         if not os.path.isfile(path):
             raise ValueError(
@@ -241,25 +222,18 @@ def shape(
     kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None
 ) -> Visual:
     """Return a shape of this kind; the other arguments as for all shapes."""
-    at = checked_real(
-        at, f"place of a {kind}", (3,), advice="give three components in the body frame, m"
-    ).astype(real_type())
-    turn = (
-        jnp.eye(3)
-        if turn is None
-        else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
-    )
+    advice = "give three components in the body frame, m"
+    at = checked_real(at, f"place of a {kind}", (3,), advice=advice).astype(real_type())
+    if turn is not None:
+        turn = checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
+    turn = jnp.eye(3) if turn is None else turn
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
 
 
 def _checked(visual: Visual) -> Visual:
     colour = visual.colour
-    if colour is not None and not (
-        isinstance(colour, str)
-        and len(colour) == 7
-        and colour[0] == "#"
-        and set(colour[1:].lower()) <= set("0123456789abcdef")
-    ):
+    known = isinstance(colour, str) and re.fullmatch("#[0-9a-fA-F]{6}", colour)
+    if colour is not None and not known:
         raise ValueError(
             f"colour of a {visual.kind} is {described(colour)}, expected six hexadecimal "
             'digits, such as "#1f77b4"'

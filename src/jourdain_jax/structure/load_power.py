@@ -26,11 +26,11 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar
 def explicit_power(
     scene: Scene, motion: Motion, of_inputs: Indices, loads: tuple[Load, ...] | None
 ) -> Scalar:
-    """Return the part of `rate_of_work` without accelerations, in W: of loads without a potential, and of
-    potentials that depend on time or on inputs.
+    """Return the part of `rate_of_work` without accelerations, in W. Three kinds of loads contribute:
 
-    sum F.v + L.omega + Q_k u_k loads without a potential dV/dt at fixed poses potentials that depend on time
-    F_i.v + L_i.omega + Q_i u - dV_i/dt loads whose potential depends on inputs, in place of that potential
+        without a potential                    sum F.v + L.omega + Q_k u_k
+        with a potential V of time             dV/dt at fixed poses
+        with a potential V_i of inputs         F_i.v + L_i.omega + Q_i u - dV_i/dt
 
     `loads`: the scene's loads at this motion, if already known.
     """

@@ -1,14 +1,14 @@
-"""The contact point of a convex body and a ground: two points with opposite normals, and the gap along the
-normal.
+"""The contact point of a convex body and a ground: two points with opposite normals, and the gap between
+them.
 
-    P(n)    the lowest point of the body where the unit vector n points up
-    x + gap n(x) = P(n(x)),   f(x) = 0
+    x + gap n(x) = P(n(x)),   f(x) = 0       x: point of the ground f = 0,  n: its normal
+                                             P(n): lowest point of the body, with n upwards
 
-On a plane n is known. A ball near a cylinder or sphere, or a wheel near a sphere, is a core with an offset:
-the core is the ball's centre or the circle within the tyre, and its nearest point is known. In all other
-cases Newton's method solves for x and the gap, four unknowns, with derivatives by the implicit function
-theorem. If it does not converge, the result is NaN. Source: P. Wriggers, Computational Contact Mechanics
-(2006), on closest points.
+On a plane n is known. A ball near a cylinder or sphere, and a wheel near a sphere, have a constant distance
+from a core, the ball's centre or the circle within the tyre. The nearest point of the core has a closed form.
+In all other cases Newton's method solves for x and the gap, four unknowns, with derivatives by the implicit
+function theorem. If it does not converge, the result is NaN. Source: P. Wriggers, Computational Contact
+Mechanics (2006), on closest points.
 """
 
 import equinox as eqx
@@ -28,7 +28,7 @@ class Ball(eqx.Module):
     radius: Scalar  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point where n points up: `c - a n`."""
+        """Return the lowest point, with n upwards: `c - a n` with the centre c and the radius a."""
         return self.centre - self.radius * n
 
 
@@ -46,8 +46,8 @@ class Wheel(eqx.Module):
         return self.radius if self.tyre is None else self.radius - self.tyre
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point where n points up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the
-        axle k.
+        """Return the lowest point, with n upwards: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the
+        centre c, the axle k, the radius R and the tyre r.
         """
         up = n - (n @ self.axle) * self.axle
         point = self.centre - self.circle * up / jnp.sqrt(up @ up)
@@ -62,8 +62,8 @@ class Ellipsoid(eqx.Module):
     semi_axes: Vector3  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point where n points up: `c - R S n'/sqrt(n'.S n')` with `n' = R' n` and the
-        squared semi-axes S.
+        """Return the lowest point, with n upwards: `c - R S n'/sqrt(n'.S n')`, with the centre c, the
+        orientation R, `n' = R' n` and the squared semi-axes S.
         """
         local = n @ self.orientation
         weighted = self.semi_axes**2 * local
@@ -88,17 +88,14 @@ def touch(shape: Shape, ground: Ground) -> Touch:
     if isinstance(shape, Ball) and isinstance(ground, Cylinder | Sphere):
         return _of_core(shape.centre, shape.radius, ground)
     if isinstance(shape, Wheel) and isinstance(ground, Sphere):
-        return _of_core(
-            _of_circle(shape, ground),
-            jnp.zeros_like(shape.radius) if shape.tyre is None else shape.tyre,
-            ground,
-        )
+        tyre = jnp.zeros_like(shape.radius) if shape.tyre is None else shape.tyre
+        return _of_core(_of_circle(shape, ground), tyre, ground)
     return _by_newton(shape, ground)
 
 
 def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
-    """Return the point of the tyre's centre circle nearest to the sphere's surface: the nearest to the
-    sphere's centre from outside, the farthest from inside.
+    """Return the point of the tyre's centre circle nearest to the sphere's surface. Outside the sphere it is
+    the nearest to the sphere's centre, inside the farthest.
     """
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle
@@ -125,9 +122,7 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
         return jnp.append(x + gap * n - shape.lowest(n), ground.value(x))
 
     guess = _guess(jax.lax.stop_gradient(shape), ground)
-    size = jnp.maximum(
-        jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), tiny_of(guess)
-    )  # the radius, nearly
+    size = jnp.maximum(jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), tiny_of(guess))  # about the radius
     root = newton_root(residual, guess, jnp.full(4, jax.lax.stop_gradient(size)))
     x, gap = root.x[:3], root.x[3]
     found = root.converged

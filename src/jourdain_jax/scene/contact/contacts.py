@@ -1,10 +1,10 @@
 """Rolling contacts without slip, of balls, ellipsoids, discs and wheels, on planes, cylinders, spheres,
 surfaces and height maps.
 
-A contact contributes two velocity constraints (no slip along the two tangents of the ground). With
-`height="row"` it also contributes one geometric constraint (zero gap). With `height="coordinates"` the
-coordinates keep the contact point on the ground, and the normal force follows from Newton's equations (row
-S1) instead of a multiplier. Spin about the normal is free.
+A contact has two velocity constraints (no slip along the two tangents of the ground). With `height="row"` it
+also has one geometric constraint (zero gap), whose multiplier is the normal force. With
+`height="coordinates"` the coordinates keep the contact point on the ground, and the normal force follows from
+Newton's equations (S1). Spin about the normal is free.
 """
 
 from collections.abc import Callable, Iterable
@@ -34,8 +34,8 @@ IMPACTS = ("moreau", "newton", "poisson", "energetic")
 
 
 class Coulomb(eqx.Module):
-    """Coulomb's law of friction, with coefficient `sliding` for a slipping contact and `static` >= `sliding`
-    for one at rest (default: equal).
+    """Coulomb's law of friction: the coefficient `sliding` of a slipping contact, and `static` >= `sliding`
+    of a contact at rest (default: equal).
     """
 
     sliding: Scalar
@@ -43,9 +43,8 @@ class Coulomb(eqx.Module):
 
     def __init__(self, sliding, static=None):
         self.sliding = checked_real(sliding, "coefficient of friction", ())
-        self.static = (
-            self.sliding if static is None else checked_real(static, "coefficient of static friction", ())
-        )
+        static = self.sliding if static is None else static
+        self.static = checked_real(static, "coefficient of static friction", ())
 
 
 class Slipping(TypedDict, total=False):
@@ -57,8 +56,8 @@ class Slipping(TypedDict, total=False):
 
 
 class Contact(eqx.Module):
-    """A point contact of a body with the ground, rolling without slip; for contacts beyond `ball_contact` and
-    similar functions.
+    """A point contact of a body with the ground, rolling without slip, at a `point` that you compute.
+    `ball_contact` and similar functions compute it.
 
     - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point of contact.
     - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a
@@ -66,14 +65,13 @@ class Contact(eqx.Module):
     - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`, shown in pictures.
     - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a geometric
       constraint.
-    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
-      bodies (default: all of the scene), for the normal force with `height="coordinates"`.
+    - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
+      supports, alone or with their other contacts (default: all bodies of the scene).
     - `distance` (m): the gap (default: the point's height above the plane).
-    - `shape`: set by `ball_contact` and similar functions, for pictures; the scene's `visuals` override it.
-    - `friction`, `restitution`: as in `ball_contact`.
+    - `shape`: for pictures, set by `ball_contact` and similar functions; the scene's `visuals` override it.
+    - `friction`, `restitution`, `impact`: as in `ball_contact`.
 
-    If the coordinates determine the point, no search is needed: `jj.Contact(pose["disc"], p, ground=hill)`.
-    Raises ValueError for an unknown height, or anything of another kind or shape.
+    Raises ValueError for an unknown height, or an argument of another kind or shape.
     """
 
     body: str = eqx.field(static=True)
@@ -118,22 +116,16 @@ class Contact(eqx.Module):
                 f"`shape` of the contact of `{self.body}` is {described(shape)}, expected a shape set by "
                 f"`ball_contact` or a similar function; {advice}"
             )
-        self.point = checked_real(
-            point,
-            f"point of the contact of `{self.body}`",
-            (3,),
-            advice="give three components in the inertial frame, m",
-        )
-        self.plane = (
-            plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
-        )
+        advice = "give three components in the inertial frame, m"
+        self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice=advice)
+        if plane is None:
+            plane = Plane() if ground is None else ground.plane_at(self.point)
+        self.plane = plane
         self.height = _checked_height(height)
         self.carried = _checked_carried(carried, self.body)
-        self.distance = (
-            None
-            if distance is None
-            else checked_real(distance, f"distance of the contact of `{self.body}`", ())
-        )
+        if distance is not None:
+            distance = checked_real(distance, f"distance of the contact of `{self.body}`", ())
+        self.distance = distance
         self.shape, self.ground = shape, ground
         self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
 
@@ -142,7 +134,7 @@ class Contact(eqx.Module):
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
     def lean(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for other shapes."""
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for others."""
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 
 
@@ -156,40 +148,45 @@ class Rolling(Slipping, total=False):
 
 
 def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Contact:
-    """Return the rolling contact of a ball with a ground, without slip; the contact point is `c - a n`.
+    """Return the rolling contact of a ball with a ground, without slip. The contact point is `c - a n`, with
+    the ground's normal n.
 
     - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
     - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a geometric
       constraint.
-    - `carried`: names of the bodies that this contact supports, together with all other contacts of these
-      bodies (default: all), for the normal force with `height="coordinates"`.
+    - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
+      supports, alone or with their other contacts (default: all bodies of the scene).
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
-      slips (`motion.phase`), and needs `height="row"`; None (default): it rolls, with any friction force.
-      `restitution` e of impacts, from 0 (default) to 1.
-    - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip afterwards. The others
-      follow the impact along its normal impulse, with friction against the momentary slip: "newton", until
-      w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic",
-      until its work is -e^2 times that of compression. They need a ball, or slip that keeps its direction, as
-      in a plane; a result code reports slip that would turn.
+      slips (`motion.phase`), and needs `height="row"`. None (default): it rolls, with any friction force.
+    - `restitution`: e of impacts, from 0 (default) to 1. `w_n`, `w_n+` are the normal velocities before and
+      after.
+    - `impact`: the law of impacts. "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip
+    afterwards.
+      The other laws integrate over the normal impulse, with friction against the momentary slip, until an
+      end: "newton", w_n+ = -e w_n; "poisson", the impulse of restitution is e times the impulse of
+      compression; "energetic", its work is -e^2 times the work of compression. They need a ball, or slip that
+      keeps its direction, as in a plane; otherwise a result code reports it.
 
     It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    height or a length that is not positive. A ball too large for its cylinder or sphere is refused when the
-    scene is built.
+    height or a length that is not positive, and when the scene is built for a ball that is too large for its
+    cylinder or sphere.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
 
 def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]) -> Contact:
-    """Return the rolling contact of an ellipsoid with a ground, without slip, at `c - R S n'/sqrt(n'.S n')`,
-    `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
+    """Return the rolling contact of an ellipsoid with a ground, without slip.
+
+    The contact point is `centre - R S n'/sqrt(n'.S n')` with the orientation R of the body, the ground's
+    normal n, `n' = R' n` and `S = diag(a^2, b^2, c^2)`. Except on planes, Newton's method finds it.
 
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in
       `ball_contact`.
 
-    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown height.
-    Except on planes, Newton's method finds the point.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
+    height.
     """
 
     def ellipsoid(centre) -> Ellipsoid:
@@ -204,14 +201,15 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
 def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Return the rolling contact of the edge of a thin disc with a ground, without slip.
 
-    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's
-    normal n and disc axis k. Undefined for a disc lying flat.
+    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|`, with the centre c, the
+    ground's normal n and the disc's axis k. It does not exist for a disc that lies flat. On a plane or a
+    sphere it has a closed form.
 
     - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in
       `ball_contact`.
 
-    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
-    height. The point is in closed form on a plane and a sphere.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis
+    or height.
     """
     return rolling(
         body,
@@ -223,18 +221,19 @@ def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unp
 def wheel_contact(
     body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]
 ) -> Contact:
-    """Return the rolling contact of a wheel with a tyre of circular section (a torus) with a ground, without
-    slip.
+    """Return the rolling contact of a wheel with a ground, without slip. The wheel's tyre has a circular
+    section, so its surface is a torus.
 
     The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`,
-    with the ground's normal n and the axle k. R is the wheel's outer radius, R - r the radius of the centre
-    circle of the tyre; r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
+    with the centre c, the ground's normal n and the axle k. R is the wheel's outer radius, R - r the radius
+    of the centre circle of the tyre; r = 0 makes a `disc_contact`. The point does not exist for a wheel that
+    lies flat. On a plane or a sphere it has a closed form.
 
     - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or
       "z". `options`: as in `ball_contact`.
 
-    Two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis or
-    height. The point is in closed form on a plane and a sphere.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis
+    or height.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
     return rolling(
@@ -269,14 +268,8 @@ def rolling(
         )
     ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position
     if centre is not None:
-        at = body.place(
-            checked_real(
-                centre,
-                f"centre of the contact of `{body.name}`",
-                (3,),
-                advice="give three components in its body frame, m",
-            )
-        )
+        advice = "give three components in its body frame, m"
+        at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice=advice))
     rolls = shape(at)
     found = touch(rolls, ground)
     return Contact(
@@ -309,11 +302,8 @@ def _slipping(
             f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
             'ground; give the body a coordinate for its height, and write height="row"'
         )
-    law = (
-        friction
-        if isinstance(friction, Coulomb)
-        else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
-    )
+    known = isinstance(friction, Coulomb)
+    law = friction if known else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
     return law, checked_real(restitution, f"restitution of the contact of `{body}`", ()), impact
 
 

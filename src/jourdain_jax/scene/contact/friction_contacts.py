@@ -1,14 +1,14 @@
 """Declarations that friction adds to a scene: a mode, three events and a direction of slip per contact.
 
 Which contacts have friction depends only on the structure of the scene, and is found once for each structure.
-Velocity constraints that hold up to a force count as contacts; they hold where others roll. For a contact
+Velocity constraints that hold up to a force count as contacts; "rolls" is then called "holds". For a contact
 `rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
     coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero unless it slips
 
-Its mechanics: `equations/phases.py`.
+`equations/phases.py` has the mechanics.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
-# used in place of a mode: why a motion cannot continue
+# values of a mode for reasons why a motion cannot continue
 GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # it never flies
@@ -44,7 +44,7 @@ class Switching:
     coordinates: Coordinates | None = None
     inputs: Names | None = None
     modes: Modes | None = None
-    rows: Labels = ()  # the velocity constraints among them, which hold up to a force
+    rows: Labels = ()  # the names of velocity constraints among `contacts`
 
     @property
     def events(self) -> Labels:
@@ -56,7 +56,7 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """Class attribute with the class's declarations, extended for instances that have contacts with friction."""
+    """Class attribute with the class's declarations, and for a scene with friction the extended ones."""
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated
@@ -85,13 +85,10 @@ def has_friction(kind: type) -> bool:
 def _words(code: CodeType) -> set[str]:
     found = set(names_in(code))
     for constant in code.co_consts:  # names of arguments are among the constants
-        found |= (
-            _words(constant)
-            if isinstance(constant, CodeType)
-            else set(constant)
-            if isinstance(constant, tuple)
-            else {constant}
-        )
+        if isinstance(constant, CodeType):
+            found |= _words(constant)
+        else:
+            found |= set(constant) if isinstance(constant, tuple) else {constant}
     return found
 
 
@@ -103,21 +100,15 @@ def switching_of(scene) -> Switching:
 
     def look(leaves) -> None:
         scene = jax.tree.unflatten(structure, leaves)
-        t, q, u, inputs = (
-            jnp.zeros(()),
-            *(
-                of.view(jnp.zeros(len(of)))
-                for of in (scene.coordinates.names, scene.speed_names, scene.inputs)
-            ),
-        )
-        at_rest = jnp.zeros(3)
+        names_of_state = scene.coordinates.names, scene.speed_names, scene.inputs
+        t, at_rest = jnp.zeros(()), jnp.zeros(3)
+        q, u, inputs = (of.view(jnp.zeros(len(of))) for of in names_of_state)
         bodies = {name: BodyMotion(name, body, at_rest, at_rest) for name, body in scene.bodies(t, q).items()}
         motion = Motion(t, q, u, q, inputs, bodies)
         contacts = scene.contacts(motion.pose())
         names.update({name: MODES_OF_CONTACT for name, c in contacts.items() if c.friction is not None})
-        names.update(
-            dict.fromkeys(held_rows(scene.velocity_constraints(motion), scene.loads(motion)), MODES_OF_ROW)
-        )
+        held = held_rows(scene.velocity_constraints(motion), scene.loads(motion))
+        names.update(dict.fromkeys(held, MODES_OF_ROW))
 
     leaves = [jax.ShapeDtypeStruct(np.shape(x), real_type()) for x in leaves]
     jax.eval_shape(look, leaves)

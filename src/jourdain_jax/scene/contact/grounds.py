@@ -4,9 +4,9 @@ rest or in rigid motion.
     n = grad f/|grad f|     unit normal out of the ground, on the side of the bodies, where f > 0
     n x p = t1, t2          two unit tangents: the directions of the no-slip constraints
 
-A moving ground states its motion twice: its shape as a function of time, and `velocity` and
-`angular_velocity`. The latter are the rates of the shape plus motion within the ground (a belt, a turntable).
-Both must agree along the normal, which is checked when a scene is probed.
+A moving ground states its motion twice: by its shape as a function of time, and by `velocity` and
+`angular_velocity`. These also include motion within the ground, as of a belt or a turntable. Along the normal
+both must agree, which is checked when a scene is probed.
 """
 
 from abc import abstractmethod
@@ -74,23 +74,24 @@ class _Ground(eqx.Module):
 
 
 class Plane(_Ground):
-    """A plane through `origin` (m), at rest or in rigid motion: the velocity of its point at p is `velocity +
-    angular_velocity x (p - origin)`.
+    """A plane through `origin` (m), at rest or in rigid motion.
 
-    `Plane(origin, tilt, velocity, angular_velocity)` is the plane z = 0, turned by `tilt`: an angle (rad)
-    about the y axis, so that positive tilt slopes down along x, or a rotation matrix (3, 3), such as
-    `jj.rot_x(0.1)`. `Plane(normal=n)` is the plane with this unit normal. `velocity` in m/s,
-    `angular_velocity` in rad/s; all vectors in the inertial frame.
-
-    The no-slip constraints act along the rotated x and y axes. With `normal`, they act along the x and y axes
-    after the shortest rotation that takes z (or -z, if n points down) to n. `along`, any vector that is not
-    normal to the plane, chooses the directions: its projection onto the plane, and across it.
+    - `tilt`: rotation of the plane z = 0, an angle (rad) about the y axis or a rotation matrix (3, 3), such
+    as
+      `jj.rot_x(0.1)`. A plane with a positive angle slopes down along x.
+    - `normal`: the unit normal n, instead of `tilt`.
+    - `velocity` (m/s) at the origin and `angular_velocity` (rad/s): the velocity of the plane's point at p is
+      `velocity + angular_velocity x (p - origin)`. All vectors are in the inertial frame.
+    - `along`: a vector that is not normal to the plane. The no-slip constraints act along its projection onto
+      the plane, and across. By default they act along the rotated x and y axes; with `normal`, after the
+      shortest rotation of z to n, or of -z if n points down.
 
     A moving plane states its motion twice: by `origin` and `tilt` or `normal` as functions of time, and by
-    `velocity` and `angular_velocity`. The latter are the rates of the former plus motion within the plane (a
-    belt, a turntable). Both must agree along the normal, which is checked when a scene is probed. Raises
-    ValueError for an `along` normal to the plane, and for both `tilt` and `normal`. A normal that is not a
-    unit vector is refused when the scene is built.
+    `velocity` and `angular_velocity`. These also include motion within the plane, as of a belt or a
+    turntable. Along the normal both must agree, which is checked when a scene is probed.
+
+    Raises ValueError for an `along` normal to the plane, for both `tilt` and `normal`, and when the scene is
+    built for a normal that is not a unit vector.
     """
 
     normal: Vector3  # unit vector, out of the ground
@@ -169,8 +170,8 @@ class _Round(_Ground):
         self._moves(what, **motion)
 
     def value(self, point: Vector) -> Scalar:
-        """Return f (m) at a `point` (m, inertial frame): half the difference of squared distance and squared
-        radius, divided by the radius.
+        """Return f = (d^2 - r^2)/(2 r) (m) at a `point` (m, inertial frame) with the distance d from the axis
+        or centre, and the radius r; -f from inside.
         """
         arm = self.arm_to(point)
         outward = (arm @ arm - self.radius**2) / (2 * self.radius)
@@ -188,17 +189,19 @@ class Cylinder(_Round):
     """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector
     `axis`.
 
-    `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin,
-    `angular_velocity` (rad/s): `rate * axis` for a turning drum. All vectors in the inertial frame. The
-    no-slip constraints act along the axis and around it. Raises ValueError for a radius that is not positive
-    or an unknown side. An axis that is not a unit vector is refused when the scene is built.
+    `side`: "inside" or "outside", where the bodies are. `velocity` (m/s): of its material point at the
+    origin; `angular_velocity` (rad/s): `rate * axis` for a turning drum. All vectors are in the inertial
+    frame. The no-slip constraints act along the axis and around it.
+
+    Raises ValueError for a radius that is not positive or an unknown side, and when the scene is built for an
+    axis that is not a unit vector.
     """
 
     axis: Vector3  # unit vector
 
     def __init__(self, radius, axis, *, side: str, **motion: Unpack[RigidMotion]):
         """Make a cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`,
-        touched from its `side`; `motion`: of the ground.
+        touched from its `side`. `motion`: origin and motion of the ground.
         """
         self._is("a cylinder", radius, side, motion)
         self.axis = checked_real(axis, "axis of a cylinder", (3,), advice="give a unit vector")
@@ -221,7 +224,7 @@ class Sphere(_Round):
     """
 
     def __init__(self, radius, *, side: str, **motion: Unpack[RigidMotion]):
-        """Make a sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground."""
+        """Make a sphere of `radius` (m), touched from its `side`; `motion`: its origin and motion."""
         self._is("a sphere", radius, side, motion)
 
     def arm_to(self, point: Vector) -> Vector3:
@@ -235,17 +238,17 @@ class Sphere(_Round):
 class Surface(_Ground):
     """The smooth surface `f(x, y, z) = 0`; f is positive on the side of the bodies.
 
-    `f`: a function of three numbers (m, inertial frame) that returns one, twice differentiable by JAX, with a
-    nonzero gradient at points of contact. It may close over traced numbers, as for a moving surface: `lambda
-    x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity`
-    (rad/s) describe the motion of the surface, all in the inertial frame. Raises ValueError for any other
-    `f`.
+    `f`: a function of three numbers (m, inertial frame) that returns one. JAX must be able to differentiate
+    it twice, and its gradient must not vanish at points of contact. It may depend on traced numbers, as for a
+    moving surface: `lambda x, y, z: z - rise * pose.t`. `velocity` (m/s) of the material point at `origin`
+    (m) and `angular_velocity` (rad/s): motion of the surface, in the inertial frame. Raises ValueError for an
+    `f` that is not callable.
     """
 
     f: Callable = static()  # (x, y, z) -> number, positive on the side of the bodies
 
     def __init__(self, f, **motion: Unpack[RigidMotion]):
-        """Make the surface on which `f(x, y, z)` is zero; `motion`: of the ground."""
+        """Make the surface on which `f(x, y, z)` is zero. `motion`: origin and motion of the ground."""
         self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
         self._moves("a surface", **motion)
 
@@ -270,15 +273,15 @@ class HeightMap(_Ground):
     """The surface `z = h(x, y)`, with the bodies above it.
 
     `h`: a function of two numbers (m, inertial frame) that returns one (m), twice differentiable by JAX.
-    `velocity` (m/s) of its material point at `origin` (m) and `angular_velocity` (rad/s) describe the motion
-    of the surface, all in the inertial frame. The first no-slip constraint acts along the projection of x
-    onto the surface. Raises ValueError for any other `h`.
+    `velocity` (m/s) of the material point at `origin` (m) and `angular_velocity` (rad/s): motion of the
+    surface, in the inertial frame. The first no-slip constraint acts along the projection of x onto the
+    surface. Raises ValueError for an `h` that is not callable.
     """
 
     h: Callable = static()  # (x, y) -> height, m
 
     def __init__(self, h, **motion: Unpack[RigidMotion]):
-        """Make the surface of height `h(x, y)`; `motion`: of the ground."""
+        """Make the surface of height `h(x, y)`. `motion`: origin and motion of the ground."""
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
         self._moves("a height map", **motion)
 
@@ -300,10 +303,8 @@ class HeightMap(_Ground):
         height, along_x = jax.jvp(self.height_at, (x, y), (i, o))
         _, along_y = jax.jvp(self.height_at, (x, y), (o, i))
         first, normal = jnp.stack([i, o, along_x]), jnp.stack([-along_x, -along_y, i])
-        first, normal = (
-            first / jnp.sqrt(1 + along_x * along_x),
-            normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y),
-        )
+        first = first / jnp.sqrt(1 + along_x * along_x)
+        normal = normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
         return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
     def point_at(self, x, y) -> Vector3:
@@ -324,8 +325,9 @@ def tangents_of(n: Vector3) -> Tangents:
     """Return two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: the x and y
     axes after the shortest rotation of z (or -z) to n.
 
-    No field of tangents is continuous on a whole sphere. These jump at n_z = 0, and with them the no-slip
-    constraints, but not their solutions. Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
+    No field of tangents is continuous on a whole sphere. These tangents, and with them the no-slip
+    constraints, jump at n_z = 0; solutions do not. Source: T. Duff et al., J. Computer Graphics Techniques 6
+    (2017) 1.
     """
     x, y, z = n
     s = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))

@@ -1,10 +1,10 @@
 """Velocity constraints that hold up to a maximum force: friction in joints, and blades that may slip
 sideways.
 
-    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        L: constraint force, N or N m
+    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        w: slip,  L: constraint force, N or N m
 
-Each is treated as a contact with friction whose normal force is one newton and whose coefficients of friction
-are the forces `F`. So it shares the modes, events and derivatives of contacts (`equations/phases.py`).
+Each counts as a contact with friction, with a normal force of one newton and the forces F as coefficients of
+friction. It then has the modes, events and derivatives of contacts (`equations/phases.py`).
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ from jourdain_jax.scene.names import check_names
 
 
 class HeldRow(eqx.Module):
-    """A velocity constraint, with `w` in m/s or rad/s, that holds up to the forces of `friction` in N or N m."""
+    """A velocity constraint `w` = 0 (m/s or rad/s) that holds up to the forces of `friction` (N or N m)."""
 
     w: Scalar
     friction: Coulomb
@@ -48,14 +48,14 @@ class JointFriction(Load):
 
 
 def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
-    """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`. A speed at rest
-    stays at rest while this needs at most the given force; otherwise the force opposes the speed.
+    """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`.
 
     - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
       static)` with two forces.
 
-    `|Q| <= F` while the speed is zero, otherwise `Q = -F u/|u|`. `motion.phase("hinge_rate")` returns whether
-    it holds or slips. Raises ValueError for an unknown speed.
+    The force Q on a speed u is `-F u/|u|`. A speed of zero stays zero as long as `|Q| <= F` suffices.
+    `motion.phase("hinge_rate")` returns whether the speed holds or slips. Raises ValueError for an unknown
+    speed.
 
     **Examples**
 
@@ -69,7 +69,7 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the constraints that hold up to a force, from the results of `velocity_constraints` and `loads`."""
+    """Return the constraints that hold up to a force, among results of `velocity_constraints` and `loads`."""
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}
