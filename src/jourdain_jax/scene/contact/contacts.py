@@ -163,9 +163,8 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     - `restitution`: e of impacts, from 0 (default) to 1. `w_n`, `w_n+` are the normal velocities before and
       after.
     - `impact`: the law of impacts. "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip
-    afterwards.
-      The other laws integrate over the normal impulse, with friction against the momentary slip, until an
-      end: "newton", w_n+ = -e w_n; "poisson", the impulse of restitution is e times the impulse of
+      afterwards. The other laws integrate over the normal impulse, with friction against the momentary slip,
+      until an end: "newton", w_n+ = -e w_n; "poisson", the impulse of restitution is e times the impulse of
       compression; "energetic", its work is -e^2 times the work of compression. They need a ball, or slip that
       keeps its direction, as in a plane; otherwise a result code reports it.
 

@@ -77,8 +77,7 @@ class Plane(_Ground):
     """A plane through `origin` (m), at rest or in rigid motion.
 
     - `tilt`: rotation of the plane z = 0, an angle (rad) about the y axis or a rotation matrix (3, 3), such
-    as
-      `jj.rot_x(0.1)`. A plane with a positive angle slopes down along x.
+      as `jj.rot_x(0.1)`. A plane with a positive angle slopes down along x.
     - `normal`: the unit normal n, instead of `tilt`.
     - `velocity` (m/s) at the origin and `angular_velocity` (rad/s): the velocity of the plane's point at p is
       `velocity + angular_velocity x (p - origin)`. All vectors are in the inertial frame.
