@@ -1,6 +1,6 @@
-"""Accelerations of a scene at one state: the dynamics underlying time integration.
+"""Accelerations of a scene at one state.
 
-kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
+kinematics -> virtual power (M, h, Q) -> constraints (A, drift) -> reduction -> udot, lambda
 """
 
 import equinox as eqx
@@ -41,11 +41,13 @@ from jourdain_jax.structure.structure import structure_of, usual_rows
 
 
 class Baumgarte(eqx.Module):
-    """Stabilisation terms of constraints: `A udot = -drift - 2 a phi - b^2 g` for geometric ones, `- a phi`
-    for velocity constraints.
+    """Stabilisation terms of constraints, with `alpha` a and `beta` b in 1/s:
 
-    `alpha` a, `beta` b in 1/s. Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection
-    (the default of `simulate`) is more accurate.
+        geometric constraints   A udot = -drift - 2 a phi - b^2 g
+        velocity constraints    A udot = -drift - a phi
+
+    Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`)
+    is more accurate.
     """
 
     alpha: Scalar = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
@@ -63,8 +65,8 @@ class Accelerations(eqx.Module):
     multipliers: Float[Array, "rows"]
     constraint_force: Speeds  # A' lambda = M udot + h - Q
     rank: Count  # of A at this state
-    # of scaled A, the last one within its usual rank (1 without constraints); the reduction's pivot if
-    # smaller
+    # of scaled A, the last one within its usual rank (1 without constraints), or a smaller pivot of the
+    # reduction
     smallest_singular_value: Scalar
     residual: Scalar  # |A udot + drift| in scaled rows; large where constraints contradict each other
     applicable: Flag  # whether this reduction works at this state
@@ -74,7 +76,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
     """Return all reductions by short name: "privileged", "qr", "svd", "kkt", "udwadia-kalaba",
     "gibbs-appell".
 
-    Two of them use the scene's privileged velocities.
+    "privileged" and "gibbs-appell" use the scene's privileged velocities.
     """
     independent = structure_of(as_scene(scene)).independent
     return {
@@ -101,13 +103,10 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         "`reduction`",
         f"a name ({', '.join(reductions(scene))}) or an object such as `jj.equations.NullSpaceQR()`",
     )
-    chosen, count = (
-        reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (),
-        len(scene.speed_names),
-    )
-    if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(
-        set(chosen)
-    ) != len(chosen):
+    chosen = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else ()
+    count = len(scene.speed_names)
+    valid = all(isinstance(i, int | np.integer) and 0 <= i < count for i in chosen)
+    if not valid or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
         raise ValueError(
             f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its "
@@ -117,7 +116,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
 
 
 def as_stabilisation(stabilisation) -> Baumgarte | None:
-    """Return the Baumgarte terms, or None. Raises ValueError for anything else."""
+    """Return the Baumgarte terms, or None. Raises ValueError for any other value."""
     check_kind(stabilisation, Baumgarte | None, "`stabilisation`", "`jj.Baumgarte(alpha, beta)` or None")
     return stabilisation
 
@@ -141,10 +140,10 @@ def accelerations(
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt",
       "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: the
+    - `usual`: typical sizes of the constraint rows; a row that is much smaller counts as lost (default: the
       scene's).
 
-    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
+    It works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
     `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError for
     an unknown reduction, and for known parameters that give impossible bodies, loads or planes. Eqs. (41),
     (68)-(70).
@@ -208,7 +207,6 @@ def reduced_at(
 def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> ConstraintRows:
     g = position_residual(scene, t, q)
     count = g.shape[0]
-    extra = jnp.concatenate(
-        [2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]]
-    )
+    geometric = 2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g
+    extra = jnp.concatenate([geometric, terms.alpha * rows.phi[count:]])
     return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names, rows.usual)

@@ -1,7 +1,6 @@
-"""The equations of Newton and Euler for each body: their residuals are the constraint force and torque on the
-body.
+"""The equations of Newton and Euler for each body. Their residuals are the constraint force R and torque T:
 
-    R = m a - F,   I alpha + omega x I omega - L
+    R = m a - F,   T = I alpha + omega x I omega - L
 
 A potential stated for the whole scene gives the forces `-dV/dr` and torques `-dV/dtheta` on its bodies.
 Source: Wang and Pao (2003), eqs. (1)-(3).
@@ -32,12 +31,12 @@ from jourdain_jax.scene.user_methods import potential_of
 
 @eager_if_concrete
 def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
-    """Return the constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega -
-    L` (N m, about the mass centre); (1)-(3).
+    """Return the constraint force `m a - F` (N) and torque `I alpha + omega x I omega - L` (N m, about the
+    mass centre) on each body; (1)-(3).
 
     Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of
-    the scene's inputs (default: zero). Impressed forces stated on speeds instead of bodies count as
-    constraint forces here.
+    the scene's inputs (default: zero). Impressed forces on speeds (`generalized_force`) count as constraint
+    forces here.
     """
     q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
@@ -79,7 +78,6 @@ def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
     """
     moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)
     if isinstance(pose.body, RigidBody):
-        moved = eqx.tree_at(
-            lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation
-        )
+        turned = pose.body.orientation + skew(turn) @ pose.body.orientation
+        moved = eqx.tree_at(lambda p: p.body.orientation, moved, turned)
     return moved

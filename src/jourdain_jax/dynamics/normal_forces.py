@@ -1,11 +1,13 @@
 """Normal forces of contacts built into the coordinates, from Newton's equations of the supported bodies.
 
-    sum_i N_i n_i = f = sum_j (m_j a_j - F_j - R_j)                                        over the carried bodies j and the contacts i that touch them
-    sum_i N_i (p_i - o) x n_i = sum_j (r_j - o) x (m_j a_j - F_j - R_j) + T_j              R_j, T_j: of the rows; T also of inertia and loads
+    sum_i N_i n_i              = sum_j f_j                            f_j = m_j a_j - F_j - R_j
+    sum_i N_i (p_i - o) x n_i  = sum_j (r_j - o) x f_j + T_j
 
-The coordinates may impose more than contacts can (a guide keeps a disc upright). So the forces are balanced
-first, by least squares, and then the moments as far as the forces leave freedom; the remaining freedom has
-minimum norm. Normal forces on a plane therefore always sum to the total load of the bodies.
+j: the carried bodies, i: the contacts that touch them, o: any point. F_j: impressed forces, R_j: constraint
+forces, T_j: moments of inertia, loads and constraints. The coordinates may impose more than contacts can, as
+a guide keeps a disc upright. So the forces are balanced first, by least squares, then the moments as far as
+the forces leave freedom. The remaining freedom has minimum norm. Normal forces on a plane thus always sum to
+the total load of the bodies.
 """
 
 import equinox as eqx
@@ -38,9 +40,9 @@ def normal_forces(
     determined.
 
     - `bodies`, `positions`: names and mass centres (m) of all bodies.
-    - `hidden`: forces on the bodies that neither loads nor constraints account for.
-    - `spare`: forces for multipliers that do not affect the motion, with a leading axis; zero for independent
-      constraints.
+    - `hidden`: forces on the bodies that are neither loads nor constraint forces.
+    - `spare`: forces of multipliers that do not affect the motion, with a leading axis of multipliers; zero
+      for independent constraints.
     - `size`: the magnitude of the forces, N.
     """
     carried = {
@@ -59,16 +61,15 @@ def _supports(carried: dict[str, Indices]) -> list[list[str]]:
     groups: list[list[str]] = []
     for name, own in carried.items():
         together = [group for group in groups if any(set(own) & set(carried[other]) for other in group)]
-        groups = [group for group in groups if group not in together] + [
-            [*(other for group in together for other in group), name]
-        ]
+        groups = [group for group in groups if group not in together]
+        groups.append([*(other for group in together for other in group), name])
     return groups
 
 
 def _of_support(
     names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size
 ) -> dict[str, tuple]:
-    # of bodies, whose equations these contacts share
+    # sets of bodies whose equations these contacts share
     sets = tuple(dict.fromkeys(carried[name] for name in names))
     points = jnp.stack([contacts[name].point for name in names])
     normals = jnp.stack([contacts[name].plane.normal for name in names])
@@ -87,9 +88,8 @@ def _of_support(
     levers = points - here
     length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), tiny_of(levers))
     by_force = (by_set * normals.T).reshape(-1, len(points))  # f = by_force N
-    by_moment = (by_set * jnp.cross(levers, normals).T).reshape(
-        -1, len(points)
-    ) / length  # moment/length = by_moment N
+    by_moment = by_set * jnp.cross(levers, normals).T
+    by_moment = by_moment.reshape(-1, len(points)) / length  # moment/length = by_moment N
 
     first = pseudo_inverse(by_force)
     left = jnp.eye(len(points)) - first @ by_force  # freedom left by the forces
@@ -104,16 +104,12 @@ def _of_support(
 
     N = solved(forces, moments)
     missed = largest(by_force @ N - forces), largest(by_moment @ N - moments / length)
-    met = (missed[0] <= tolerance * size) & (
-        missed[1] <= tolerance * (size + largest(hidden.torque) / length)
-    )
-    by_forces_alone, by_both = (
-        jnp.abs(jnp.diagonal(left)) <= tolerance,
-        jnp.abs(jnp.diagonal(open_still)) <= tolerance,
-    )
-    determined = jax.lax.stop_gradient(
-        (by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance)
-    )
+    size_of_moments = size + largest(hidden.torque) / length
+    met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * size_of_moments)
+    by_forces_alone = jnp.abs(jnp.diagonal(left)) <= tolerance
+    by_both = jnp.abs(jnp.diagonal(open_still)) <= tolerance
+    unmoved = _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance)
+    determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & unmoved)
     return {name: (N[i], determined[i]) for i, name in enumerate(names)}
 
 
@@ -135,8 +131,6 @@ def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance)
 def _carried(contact: Contact, name: str, bodies: Labels) -> Indices:
     """Return indices of the bodies that a contact supports."""
     check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
-    return (
-        tuple(range(len(bodies)))
-        if contact.carried is None
-        else tuple(sorted({bodies.index(body) for body in contact.carried}))
-    )
+    if contact.carried is None:
+        return tuple(range(len(bodies)))
+    return tuple(sorted({bodies.index(body) for body in contact.carried}))

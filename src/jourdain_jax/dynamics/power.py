@@ -1,16 +1,20 @@
 """The power that changes the energy T + V of a scene.
 
-    d(T + V)/dt = sum F.v + L.omega + Q_k u_k   loads without a potential
-                + (A' lambda).u                 constraints that do work: prescribed, nonhomogeneous, nonlinear
-                + sum R.v_0 + T.omega_0         poses driven in time; v_0, omega_0: velocities at u = 0
-                + dV/dt at fixed poses          potentials that depend on time
-                + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
+    d(T + V)/dt = sum F.v + L.omega + Q_k u_k                loads without a potential
+                + (A' lambda).u                              constraints that do work
+                + sum R.v_0 + T.omega_0                      poses driven in time
+                + dV/dt at fixed poses                       potentials that depend on time
+                + sum mdot v.v/2 + omega.(dI/dt omega)/2     masses and inertias that change
 
-Terms that are zero at every state by the scene's structure are not computed. Inputs count as constant here;
-their rates enter constraints through the accelerations. If the potential V_i of a load depends on inputs f,
-these also do the work dV_i/df . df/dt. It is computed without differentiating the inputs, which may jump:
+Constraints that do work are prescribed, nonhomogeneous or nonlinear. R, T: constraint force and torque on a
+body; v_0, omega_0: its velocities at u = 0. Matter that joins a body has the velocity of the body. Terms that
+are zero at every state by the scene's structure are not computed.
 
-    W = integral of (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)        (`rate_of_work`, `stored_by_inputs`)
+Inputs f count as constant here; their rates enter constraints through the accelerations. If the potential V_i
+of a load depends on inputs, they also do the work dV_i/df . df/dt. Inputs may jump, so it is computed without
+their derivative (`rate_of_work`, `stored_by_inputs`):
+
+    W = int (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)
 
 Source: Wang and Pao (2003), eqs. (71)-(73).
 """
@@ -48,16 +52,12 @@ class Power(eqx.Module):
 
 
 def needs_work(scene: Scene, structure: Structure) -> bool:
-    """Return whether anything changes T + V, so that the work must be integrated with the motion. Terms that
-    are zero by structure do not count.
+    """Return whether a term of d(T + V)/dt may be nonzero, so that the work must be integrated with the
+    motion.
     """
-    by_structure = (
-        structure.driven
-        or structure.varying_inertia
-        or _rows_work(structure)
-        or "potential" in structure.timed
-    )
-    return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
+    moved = structure.driven or structure.varying_inertia or _rows_work(structure)
+    by_potentials = "potential" in structure.timed or bool(structure.potentials_of_inputs)
+    return moved or by_potentials or has_load_without_potential(scene)
 
 
 def _rows_work(structure: Structure) -> bool:
@@ -68,16 +68,13 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     """Return the power that changes T + V, in W, by its causes."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
+    explicit = structure.driven or "potential" in structure.timed
     return Power(
         loads=power_of_loads(scene, motion, conservative=False),
         # lambda . (A u), which is lambda . phi = 0 for constraints homogeneous and linear in u
         rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
-        potential=(
-            explicit_rate(scene, motion, potential_energy)
-            if structure.driven or "potential" in structure.timed
-            else zero
-        ),
+        potential=explicit_rate(scene, motion, potential_energy) if explicit else zero,
         inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
     )
 
@@ -85,11 +82,10 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 def rate_of_work(
     scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices
 ) -> Scalar:
-    """Return the integrand of the work, in W: the power of the loads. The loads `of_inputs` contribute by
-    their forces instead of their potentials.
+    """Return the integrand of the work W, in W.
 
-    `of_inputs`: indices of the loads whose potential depends on inputs. Their stored energy
-    (`stored_by_inputs`) is added to the integral.
+    `of_inputs`: indices of the loads whose potential depends on inputs. They contribute by their forces.
+    Their stored energy (`stored_by_inputs`) is added to the integral.
     """
     return power(scene, motion, accelerations).total + forces_for_potentials(scene, motion, of_inputs)
 

@@ -43,8 +43,7 @@ class RowReactions(eqx.Module):
     torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
     # on speeds, from constraints written in coordinates, rates or speeds
     direct: Float[Array, "*times rows speeds"]
-    # whether the multiplier is unique; False for dependent rows, with minimum norm
-    determined: Bool[Array, "*times rows"]
+    determined: Bool[Array, "*times rows"]  # False for a dependent row, whose multiplier is not unique
     row_names: Labels = static()
     body_names: Labels = static()
 
@@ -64,22 +63,19 @@ class RowReactions(eqx.Module):
 class ContactForce(eqx.Module):
     """The force of the ground on the body at one rolling contact."""
 
-    normal: Scalar  # N, along the plane's normal; negative if the contact would have to pull
+    normal: Scalar  # N, along the plane's normal; negative if the contact pulls
     tangential: Float[Array, "2"]  # N, along the plane's tangents
-    # |tangential| / normal; infinite if the contact would have to pull, zero if it carries no load
-    friction_needed: Scalar
+    friction_needed: Scalar  # |tangential| / normal; infinite if the contact pulls, zero without load
     pulls: Flag  # whether the normal force is negative beyond round-off: the body would lift off
-    determined: Flag  # whether the constraints determine these numbers
-    # whether they determine the normal force; two wheels of one axle may still share the tangential one
-    normal_determined: Flag
+    determined: Flag  # whether the constraints determine both forces
+    normal_determined: Flag  # whether they determine the normal force
 
 
 @eager_if_concrete
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
-    """Return constraint forces per row and per body at (t, q, u), from the multipliers of the given
-    `accelerations`.
+    """Return constraint forces per row and per body at (t, q, u), from the multipliers of `accelerations`.
 
-    Their generalized forces add up to `A' lambda`: `sum_s beta' R^s + gamma' T^s + direct^s`.
+    Their generalized forces `sum_s beta' R^s + gamma' T^s + direct^s` sum to `A' lambda`.
     """
     motion = motion_at(scene, t, q, u, inputs)
     return _reactions(scene, motion, _per_multiplier(scene, motion, inputs), accelerations.multipliers)
@@ -101,8 +97,8 @@ def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowRea
 
 
 def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
-    """Return the forces on bodies and on speeds for a unit multiplier of each row (leading axes), and the
-    result of `_spare_multipliers`.
+    """Return forces on bodies and on speeds for a unit multiplier of each row (first axis), and the result of
+    `_spare_multipliers`.
     """
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
     if not names_of_rows(scene):
@@ -135,10 +131,8 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
 def _spare_multipliers(
     A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]
 ) -> Float[Array, "rows rows"]:
-    """Return multipliers, as columns, with `A' lambda = 0`, which do not affect the motion; zero for
-    independent rows.
-
-    `typical`: lengths of the rows, as in `row_scale`.
+    """Return multipliers with `A' lambda = 0`, as columns. They do not affect the motion; independent rows
+    have none (zero). `typical`: typical lengths of the rows.
     """
     scale = row_scale(A, typical)
     A = jax.lax.stop_gradient(scale[:, None] * A)
@@ -155,12 +149,13 @@ def contact_forces(
 
     The tangential force is the multiplier of the no-slip constraints. With `height="row"` the normal force is
     the multiplier of the height constraint. With `height="coordinates"` it follows from the balance of forces
-    and moments (row S1) of the bodies that the contact carries: `sum N n = sum (m a - F - R_rows)`, and the
-    same for moments; the left sum is over all contacts of these bodies. If the balance does not determine it
-    (four wheels on a plane), the normal force has minimum norm and is marked as not determined. The same mark
-    shows a remaining moment that no contact can exert, such as the moment of a guide that keeps a robot
-    level. Forces on speeds (`generalized_force`) are assumed to have no resultant force or moment on these
-    bodies.
+    and moments (S1) of the bodies that the contact carries. For forces, with sums over all contacts of these
+    bodies and over these bodies: `sum N n = sum (m a - F - R)`.
+
+    If the balance does not determine the normal force (four wheels on a plane), the force has minimum norm,
+    and `determined` is False. `determined` is also False if a moment remains that no contact can exert, such
+    as the moment of a guide that keeps a robot level. Forces on speeds (`generalized_force`) are assumed to
+    have no resultant force or moment on these bodies.
     """
     motion = motion_at(scene, t, q, u, inputs)
     contacts = contacts_of(scene, motion.pose())
@@ -181,12 +176,9 @@ def contact_forces(
     if scene.switching.contacts:
         found = switching_forces(scene, motion, contact_response(scene, motion))
         sure = jnp.array(True)
-        by_name = dict(zip(scene.switching.contacts, found.reshape(-1, 3), strict=True))
-        forces = {
-            name: _contact_force(L[0], L[1:], sure, sure, margin)
-            for name, L in by_name.items()
-            if name in contacts
-        }
+        for name, L in zip(scene.switching.contacts, found.reshape(-1, 3), strict=True):
+            if name in contacts:
+                forces[name] = _contact_force(L[0], L[1:], sure, sure, margin)
     for name, contact in contacts.items():
         if name in forces:
             continue

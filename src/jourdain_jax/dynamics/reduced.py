@@ -1,21 +1,19 @@
-"""Ignorable coordinates, found by probing, and the reduced Appell equations (42) without them (S9).
+"""Ignorable coordinates, found by probes, and the reduced Appell equations (42) without them (S9).
 
-A dependent coordinate, whose rate is no privileged velocity, is *cyclic* if none of these quantities depends
-on it, in the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial
-velocities beta and partial angular velocities gamma, the inertias R I R' of the bodies, the impressed forces
-and torques, the forces on speeds, and the potential's gradient. (If beta does not depend on it, neither does
-betadot.) In these axes the spin of an axisymmetric wheel is cyclic. A coordinate is *ignorable* if the
-privileged accelerations do not depend on it, a symmetry and a weaker condition.
+A coordinate is *cyclic* if its rate is no privileged velocity and none of these quantities depends on it, in
+the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial velocities
+beta and gamma, the inertias R I R' of the bodies, the impressed forces and torques, the forces on speeds, and
+the potential's gradient. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if the
+privileged accelerations do not depend on it, which is a weaker condition.
 
 Both kinds are fixed at the reference, and the system is integrated in the other, *kept* coordinates k alone:
 
     dk/dt = B_k(t, k) y + b_k(t, k),     dy/dt = yddot(t, k, y)
 
 The dropped coordinates d follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in
-groups: a group may need coordinates recovered before (the disc's x and y need its yaw). `simulate` integrates
-them with the others instead. An ignorable coordinate is kept if a kept rate depends on it, or if its own rate
-does (quaternions, the sleigh's heading), since quadrature cannot recover it. Source: Wang and Pao (2003), eq.
-(42).
+groups: the disc's x and y need its yaw. `simulate` integrates all coordinates instead. Quadrature cannot
+recover a coordinate if its own rate or a kept rate depends on it (quaternions, the sleigh's heading); it is
+kept. Source: Wang and Pao (2003), eq. (42).
 """
 
 from dataclasses import dataclass
@@ -52,16 +50,17 @@ class AdmissibleRates(eqx.Module):
 class Dependence(eqx.Module):
     """Dependence of quantities on coordinates (columns) at any of the probed states."""
 
-    # any quantity that a cyclic coordinate must not affect
-    cyclic_quantities: Bool[np.ndarray, "coordinates"]
+    cyclic_quantities: Bool[
+        np.ndarray, "coordinates"
+    ]  # any quantity that a cyclic coordinate must not affect
     rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, by entry
     accelerations: Bool[np.ndarray, "coordinates"]  # the privileged accelerations
     privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is a privileged velocity
 
 
 def cyclic_coordinates(scene: Scene) -> Labels:
-    """Return the dependent coordinates on which neither B, b, beta, gamma, R I R' nor the impressed forces
-    depend.
+    """Return the cyclic coordinates: their rates are not privileged, and B, b, beta, gamma, R I R' and the
+    impressed forces do not depend on them.
 
     There are none for constraints nonlinear in the speeds. A quaternion is never cyclic: its own rate depends
     on it.
@@ -83,9 +82,7 @@ def ignorable_coordinates(scene: Scene) -> Labels:
 
 
 def _named(scene: Scene, chosen) -> Labels:
-    """Return names of the chosen coordinates; a quaternion is named only if all four of its entries are
-    chosen.
-    """
+    """Return names of the chosen coordinates, among them quaternions with all four entries chosen."""
     names: list[str] = []
     groups = {first: group for group, first, _ in scene.coordinate_names.groups}
     skipped: set[int] = set()
@@ -100,11 +97,11 @@ def _named(scene: Scene, chosen) -> Labels:
 
 @once_per_values
 def dependence(scene: Scene) -> Dependence:
-    """Return the dependence of quantities on coordinates, found by displacing each coordinate alone at random
-    states.
+    """Return the dependence of quantities on coordinates, by displacement of each coordinate alone at random
+    states. Constraints must be affine in the speeds.
 
-    The states do not satisfy the geometric constraints: otherwise a coordinate that they hold would seem to
-    have no influence. Constraints must be affine in the speeds.
+    The states are off the geometric constraints: otherwise a coordinate that is constant on these would seem
+    to have no influence.
     """
     generator = np.random.default_rng(0)
     t, q, u = sample_states(scene, 8)
@@ -113,9 +110,8 @@ def dependence(scene: Scene) -> Dependence:
     values, one_speed = _probe(scene, t, q, u, shifts)
     changed = {name: _changed(value) for name, value in values.items()}
     appears = [changed[name].any(axis=0) for name in values if name not in ("rates", "accelerations")]
-    return Dependence(
-        np.any(appears, axis=0), changed["rates"], changed["accelerations"].any(axis=0), one_speed.all(axis=0)
-    )
+    accelerations = changed["accelerations"].any(axis=0)
+    return Dependence(np.any(appears, axis=0), changed["rates"], accelerations, one_speed.all(axis=0))
 
 
 def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
@@ -129,8 +125,8 @@ def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
 
 @eval_numpy
 def _probe(scene: Scene, t, q, u, shifts):
-    """Return quantities by name at every state, without displacement and with each coordinate displaced
-    alone, and the coordinates whose rate is one speed.
+    """Return quantities by name at every state, first without displacement and then with each coordinate
+    displaced alone. Also return which coordinates have one speed as their rate.
     """
 
     def one(t, q, u, shifts):
@@ -160,19 +156,10 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     velocities = jnp.concatenate([jnp.concatenate([body.velocity, body.angular_velocity]) for body in bodies])
     turned = of_bodies(motion, "orientation")
     inertia = jnp.einsum("bij,bjk,blk->bil", turned, known.weights.inertia, turned)
-    beta, gamma = (
-        known.partial.bodies.linear @ C,
-        jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C),
-    )
-    loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
-    forces = [
-        loads.force,
-        loads.torque,
-        loads.direct @ C,
-        potential.force,
-        potential.torque,
-        potential.direct @ C,
-    ]
+    beta = known.partial.bodies.linear @ C
+    gamma = jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C)
+    both = resultants(scene, motion), potential_resultants(scene, motion)
+    forces = [part for of in both for part in (of.force, of.torque, of.direct @ C)]
     return {
         "rates": motion.qdot.array,
         # y, constant in the coordinates, gives free motion a size
@@ -188,9 +175,8 @@ def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
     """Return C, c, B and b at one state of a scene whose constraints are affine in the speeds."""
     structure = structure_of(scene)
     y = u[jnp.array(structure.independent, jnp.int32)]
-    return _rates_of(
-        scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
-    )
+    known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
+    return _rates_of(scene, t, q, known)
 
 
 def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
@@ -238,15 +224,14 @@ def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
 
 
 def _groups(droppable: set[int], needs) -> list[list[int]]:
-    """Return groups of coordinates in the order in which quadrature recovers them; `needs[i, j]`: whether the
+    """Return groups of coordinates in the order in which quadrature recovers them. `needs[i, j]`: whether the
     rate of i depends on j.
     """
     while True:
         groups, known = [], set(range(len(needs))) - droppable
         needed_by_kept = {j for j in droppable if any(needs[i, j] for i in known)}
-        while ready := [
-            i for i in sorted(droppable - known) if set(np.flatnonzero(needs[i]).tolist()) <= known
-        ]:
+        is_ready = lambda i, known=known: set(np.flatnonzero(needs[i]).tolist()) <= known
+        while ready := list(filter(is_ready, sorted(droppable - known))):
             groups.append(ready)
             known |= set(ready)
         in_circles = droppable - known  # rates that depend on themselves or on each other

@@ -7,8 +7,8 @@ the same way, so one law serves both.
     sticks:   (G L + b)_t = 0, |L_t| <= mu L_n
     slips:    L_t = -mu L_n e,  (G L + b)_t along e
 
-Rows of a contact: normal, then the two tangents of the ground. Source of the limit directions: M. Antali and
-G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
+Each contact has three rows: the normal n, then the two tangents t of the ground. e: direction of slip. Source
+of the limit directions: M. Antali and G. Stepan, Nonlinear Dynamics 97 (2019) 1799.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar
 
-# Gauss-Seidel sweeps per contact; Newton steps for one contact, plus one for each further one
+# Gauss-Seidel sweeps per contact; Newton steps of one contact, one more for each further contact
 SWEEPS, STEPS = 4, 5
-SLOW = 5e-6  # m/s: below this slip speed the direction turns as at this speed
+SLOW = 5e-6  # m/s: the direction of slower slip turns as at this speed
 ROUND_OFF = 1e-9  # of responses
 LEAST_SLIP = 1e-8  # m/s: round-off of speeds that impulses change
 LEAST_PIVOT = 1e-12  # relative to the diagonal entry before elimination
@@ -34,8 +34,8 @@ def solved(
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
-    An unknown with a vanishing pivot becomes zero, such as the force across a plane in which all bodies move;
-    `vanishes`: whether a pivot may vanish.
+    `vanishes`: whether a pivot may vanish. An unknown with a vanishing pivot becomes zero, such as the force
+    across a plane in which all bodies move.
     """
     count, inverses = len(K), []
     rows = [jnp.concatenate([a, b]) for a, b in zip(K, right, strict=True)]
@@ -58,7 +58,7 @@ def solved(
 
 
 class Modes(NamedTuple):
-    """The modes of all contacts, as numbers 0 or 1, and the directions of slip of slipping ones."""
+    """The modes of all contacts, as numbers 0 or 1, and directions of slip."""
 
     closed: Float[Array, "contacts"]
     rolls: Float[Array, "contacts"]
@@ -68,9 +68,11 @@ class Modes(NamedTuple):
 def system(
     G: Float[Array, "rows rows"], modes: Modes, friction: Float[Array, "contacts"]
 ) -> tuple[Float[Array, "rows rows"], Float[Array, "rows"]]:
-    """Return K and s of `K L = -s b`, the laws of all contacts in their modes.
+    """Return K and s of `K L = -s b`, the laws of all contacts in their modes:
 
-    s_n (G L + b)_n + (1 - s_n) L_n = 0,   s_t (G L + b)_t + (1 - s_t) (L_t + mu L_n e) = 0
+        s_n (G L + b)_n + (1 - s_n) L_n = 0,   s_t (G L + b)_t + (1 - s_t) (L_t + mu L_n e) = 0
+
+    s_n is 1 for closed contacts, s_t for rolling contacts; otherwise both are 0.
     """
     s = jnp.stack([modes.closed, modes.rolls, modes.rolls], axis=1).ravel()
     along = friction[:, None] * modes.direction
@@ -110,9 +112,9 @@ class Law(NamedTuple):
     target: Float[Array, "contacts"]  # least normal response
     friction: Float[Array, "contacts"]  # mu of slip
     static: Float[Array, "contacts"]  # mu of sticking
-    touches: Bool[Array, "contacts"]  # all others have no force
+    touches: Bool[Array, "contacts"]  # whether there may be a force
     slides: Bool[Array, "contacts"]  # slips in the direction e, whatever the response
-    begins: Bool[Array, "contacts"]  # starts to slip: closed, in an unknown direction
+    begins: Bool[Array, "contacts"]  # is closed and starts to slip in an unknown direction
     e: Float[Array, "contacts 2"]
 
 
@@ -126,18 +128,19 @@ class Solution(NamedTuple):
 
 @jax.jit
 def coulomb(law: Law) -> Solution:
-    """Return forces that satisfy Coulomb's law at all contacts simultaneously, with w = G P + b.
+    """Return forces P that satisfy Coulomb's law at all contacts simultaneously, with w = G P + b.
 
         w_n >= target and P_n >= 0, one of them with equality;
         w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
 
     Projected Gauss-Seidel sweeps come first. Then Newton's method solves the equations of the modes for
-    forces and directions. Before each step it chooses the modes by the signs of
+    forces and directions, which also give the derivatives. Before each step it chooses the modes by the signs
+    of
 
         N = P_n - (w_n - target)/G_nn,   |T| - mu_s N with T = P_t - w_t/tr G_tt
 
-    Derivatives are those of these equations. Redundant contacts keep the shares that the sweeps find. Source:
-    P. Alart and A. Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
+    Redundant contacts keep their shares from the sweeps. Source: P. Alart and A. Curnier, Comput. Methods
+    Appl. Mech. Eng. 92 (1991) 353.
     """
     count = len(law.target)
     P = jnp.zeros((count, 3), law.b.dtype)
@@ -152,7 +155,7 @@ def coulomb(law: Law) -> Solution:
 
 @partial(jax.jit, static_argnums=2)
 def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "contacts 3"]:
-    """Return the forces after contact j has taken those that its law asks for, given the others."""
+    """Return the forces after one sweep at contact j: its force by the law, with the other forces given."""
     normal, tangential = _scales(law.G)
     w = law.G[3 * j : 3 * j + 3] @ P.ravel() + law.b[3 * j : 3 * j + 3]
     N = jnp.where(law.touches[j], jnp.maximum(P[j, 0] - (w[0] - law.target[j]) * normal[j], 0.0), 0.0)
@@ -187,7 +190,8 @@ def _improved(
 ) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
     """Return forces and directions of slip after one step of Newton's method.
 
-    The unknowns are P and the angles of the unknown directions e, which satisfy n.w_t = 0 with n = J e.
+    The unknowns are P and the angles of the unknown directions e. They satisfy n.w_t = 0, where n is e turned
+    by a right angle.
     """
     (K, s), e = system(law.G, modes, law.friction), modes.direction
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
@@ -211,9 +215,8 @@ def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, 
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction
     least = ROUND_OFF * jnp.sum(jnp.abs(law.b))
     excess, slip, N = w[:, 0] - law.target, w[:, 1:], P[:, 0]
-    held = (
-        jnp.sum(P[:, 1:] ** 2, axis=1) <= (law.static * N) ** 2 * (1 + ROUND_OFF) + (least * tangential) ** 2
-    )
+    square = jnp.sum(P[:, 1:] ** 2, axis=1)
+    held = square <= (law.static * N) ** 2 * (1 + ROUND_OFF) + (least * tangential) ** 2
     aside = jnp.abs(e[:, 0] * slip[:, 1] - e[:, 1] * slip[:, 0])
     slips = law.slides | ((jnp.sum(e * slip, axis=1) >= -least) & (aside <= least))
     sticks = held & (jnp.sum(slip * slip, axis=1) <= least**2)
@@ -243,23 +246,18 @@ class Impulse(NamedTuple):
 
 @partial(jax.jit, static_argnums=0)
 def impulse(
-    kind: str,
-    G: Float[Array, "3 3"],
-    w: Float[Array, "3"],
-    restitution: Scalar,
-    friction: Scalar,
+    kind: str, G: Float[Array, "3 3"], w: Float[Array, "3"], restitution: Scalar, friction: Scalar
 ) -> Impulse:
-    """Return the impulse at a contact that strikes with the speeds w; `restitution`: e.
+    """Return the impulse P at a contact that strikes with the speeds w, by the law `kind`; `restitution`: e.
 
-        dw/ds = G (1, -mu e_t) along the normal impulse s, e_t along w_t; once slip has stopped, the contact
-        sticks, or slips along the limit direction
+        dw/ds = G (1, -mu e_t)      s: normal impulse,  e_t: direction of slip, along w_t
 
-        newton:     until w_n+ = -e w_n
-        poisson:    until s = (1 + e) s_c              c: the compression, which ends at w_n = 0
-        energetic:  until W_r = -e^2 W_c               W: work of the normal impulse, in both parts
+        newton       until w_n+ = -e w_n
+        poisson      until s = (1 + e) s_c             s_c: s at the end of compression, w_n = 0
+        energetic    until W_r = -e^2 W_c              W_c, W_r: work of s in compression and restitution
 
-    The speeds w change linearly in each of two pieces, before and after the end of slip. P is NaN if slip
-    would turn during the first. Source: W. J. Stronge, Impact Mechanics (2000).
+    Once slip has stopped, the contact sticks, or slips along the limit direction. The speeds change linearly
+    before and after this. P is NaN if slip would turn before. Source: W. J. Stronge, Impact Mechanics (2000).
     """
     at_rest = coulomb(_one(G, friction))  # for a unit rise of w_n
     by_stop, sticks = at_rest.P[0], at_rest.modes.rolls[0] > 0
@@ -269,10 +267,9 @@ def impulse(
     slides = jnp.append(jnp.ones_like(friction), -friction * e)
     rates = G @ slides
     first, slowing = rates[0], -(e @ rates[1:])
-    stops = jnp.where(
-        moving, jnp.where(slowing > 0, e @ w[1:] / jnp.where(slowing > 0, slowing, 1.0), jnp.inf), 0.0
-    )
-    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n when slip stops
+    at_stop = jnp.where(slowing > 0, e @ w[1:] / jnp.where(slowing > 0, slowing, 1.0), jnp.inf)
+    stops = jnp.where(moving, at_stop, 0.0)  # normal impulse when slip stops
+    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n then
 
     def reached(goal: Scalar) -> Scalar:
         """Return the normal impulse at which w_n reaches the value `goal`."""
@@ -296,7 +293,7 @@ def impulse(
             w[0] ** 2 / (2 * rise),
             -(w[0] + stop_w) * jnp.where(within, 0.0, stops) / 2 + stop_w**2 / (2 * then),
         )
-        # if restitution were one piece
+        # w_n+ by the law if slip stops during compression or not at all; otherwise restitution has two pieces
         one = restitution * jnp.sqrt(2 * jnp.where(within, rise, then) * work)
         rest = restitution**2 * work - stop_w**2 / (2 * rise)
         two = within & jnp.isfinite(stops) & (rest > 0)

@@ -1,7 +1,8 @@
-"""Kinematics of switching contacts, and of constraints that hold up to a force: gaps, their rates, and slip,
-with the derivatives that their forces need.
+"""Kinematics of switching contacts, and of constraints that hold up to a force: gaps, speeds, and
+derivatives.
 
-    w = (dg/dt, slip along the tangents)    of each contact;   w = A u + a,   dw/dt = A udot + drift
+    w = (dg/dt, slip along the tangents)    of each contact with gap g
+    w = A u + a,   dw/dt = A udot + drift
 """
 
 from typing import NamedTuple
@@ -31,7 +32,7 @@ class ContactRows(eqx.Module):
 
 
 class SwitchingRow(NamedTuple):
-    """A contact with friction, or a constraint that holds up to a force, as used by the laws of contact."""
+    """A contact with friction, or a constraint that holds up to a force, for the laws of contact."""
 
     friction: Coulomb
     slip: Float[Array, "2"]  # m/s or rad/s
@@ -97,8 +98,8 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
-    """Return the forces of the ground on the bodies as loads: normal forces, and forces along both tangents.
-    Constraints that hold up to a force give forces on the speeds, A' L.
+    """Return the normal and tangential forces of the ground on the bodies as loads, and the forces A' L of
+    constraints that hold up to a force on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

@@ -36,9 +36,8 @@ class At:
     ):
         self.scene, self.motion, self.responses = scene, motion, [] if responses is None else responses
         self.found = contact_response(scene, motion) if found is None else found
-        self.responses += (
-            [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
-        )
+        if found is None:
+            self.responses.append((motion.q.array, motion.u.array, motion.inputs.array, self.found))
         rows = switching_rows(scene, motion).values()
         self.friction = jnp.stack([row.friction.sliding for row in rows])
         self.static = jnp.stack([row.friction.static for row in rows])

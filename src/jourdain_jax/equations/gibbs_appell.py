@@ -1,10 +1,10 @@
 """The Gibbs function and the Gibbs-Appell equations.
 
-    G = sum m a.a / 2 + alpha.I alpha / 2 + alpha.(omega x I omega),     dG/d(yddot_k) = Q_k          (12)-(17)
+    G = sum m a.a / 2 + alpha.I alpha / 2 + alpha.(omega x I omega),     dG/d(yddot_k) = Q_k     (12)-(17)
 
-G is evaluated from the bodies' accelerations, and automatic differentiation gives its gradient and Hessian.
-So this is an independent way to the same equations: the Hessian of G in udot is M, its gradient at `udot = 0`
-is h. Source: Wang and Pao (2003), section II.
+G follows from the bodies' accelerations; automatic differentiation gives its Hessian M in udot, and its
+gradient h at `udot = 0`. This derivation of the equations of motion is independent of the others. Source:
+Wang and Pao (2003), section II.
 """
 
 import equinox as eqx
@@ -60,7 +60,7 @@ def _gradient_and_hessian(f, x):
 class GibbsAppell(eqx.Module):
     """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
 
-    `independent`: indices of the privileged speeds. It does not apply where these do not determine the other
+    `independent`: indices of the privileged speeds. The reduction applies where they determine the other
     speeds.
     """
 

@@ -2,9 +2,10 @@
 
     u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
 
-Contacts that close at one instant strike together; closed contacts take part with restitution 0 (`coulomb` in
-`contact_laws.py`). If a single contact strikes, `impulse` may follow its slip along the impulse instead.
-Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications (1988).
+P are the impulses, e the restitution. Contacts that close at one instant strike together, and closed contacts
+take part with restitution 0 (`coulomb` in `contact_laws.py`). For a single contact that strikes, `impulse`
+may integrate over the normal impulse instead. Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications
+(1988).
 """
 
 from typing import NamedTuple
@@ -59,8 +60,8 @@ class Struck(NamedTuple):
 
 
 def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "contacts"], i: int) -> Struck:
-    """Return the impulses of an impact, by the law of contact i along its impulse, or by the simultaneous law
-    for all contacts.
+    """Return the impulses of an impact: by `impulse` at contact i, or by Moreau's law at all contacts at
+    once.
     """
     e_n = jnp.where(strikes & (-at.restitution * at.w[:, 0] > LEAST_REBOUND), at.restitution, 0.0)
     no, w = jnp.zeros_like(touches), at.found.rows.w
@@ -81,9 +82,9 @@ def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "cont
 class After:
     """Speeds, modes and directions of slip after an event of contact i.
 
-    The impulses either stop the slip of contacts or, if a contact strikes, are those of the impact. Then the
-    law at rest decides whether contacts without slip open, stick or start to slip. If there is no solution,
-    or an impact would gain energy, the mode of contact i is a negative number that encodes the reason.
+    Impulses of an impact act if a contact strikes; otherwise impulses stop the slip of contacts. Then the law
+    at rest decides whether contacts without slip open, stick or start to slip. If it has no solution, or an
+    impact would gain energy, the mode of contact i is a negative number for the reason.
     """
 
     def __init__(self, at: At, i: int, changes: Changes):

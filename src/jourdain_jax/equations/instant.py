@@ -2,10 +2,10 @@
 motion, computed together.
 
     v, omega, phi              at (t, q, u)
-    beta, gamma, A             their derivatives in u             (for rows affine in u they do not depend on u)
+    beta, gamma, A             their derivatives in u; for rows affine in u they do not depend on u
     a_0, alpha_0, drift        their rates at udot = 0
 
-Poses are the costly part of a scene, and all these quantities share one evaluation of them.
+Poses are the costly part of a scene, so all these quantities share one evaluation of the poses.
 """
 
 import equinox as eqx
@@ -62,8 +62,8 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
 
 @eager_if_concrete
 def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
-    """Return phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all constraint rows, with their
-    names: `A udot = -drift`; eqs. (5)-(9), (25).
+    """Return phi, `A = d phi/du`, the drift and the names of all constraint rows: `A udot = -drift`, where
+    the drift is `d phi/dt` at `udot = 0`; eqs. (5)-(9), (25).
 
     `inputs`: values of the scene's inputs (default: zero). Geometric constraints enter by their rate and come
     first.
@@ -72,7 +72,7 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
-    """Return `beta`, `gamma` and `A`, the velocities and residuals, and the motion that they belong to."""
+    """Return `beta`, `gamma` and `A`, then velocities and residuals, and the motion at these arguments."""
     t, q, u = as_time(t), as_real(q), as_real(u)
 
     def level(u):

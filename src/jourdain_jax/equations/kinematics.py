@@ -2,9 +2,10 @@
 
     qdot = N u + nu          v = d r/dt,  omega = vee(Rdot R')          along (1, qdot)
     v = beta u + v_t,        omega_body = gamma u + omega_t             partial velocities (26)-(31), (49)
-    a = beta udot + a_0,     alpha_body = gamma udot + alpha_0          a_0, alpha_0: the accelerations at udot = 0
+    a = beta udot + a_0,     alpha_body = gamma udot + alpha_0          a_0, alpha_0: at udot = 0
 
-Source: Wang and Pao (2003), sections III and V.
+r, R: position and orientation of a body; v, a, omega, alpha: its velocities and accelerations. Source: Wang
+and Pao (2003), sections III and V.
 """
 
 from collections.abc import Callable
@@ -58,14 +59,14 @@ def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     """Return poses of all bodies (m, inertial frame), sorted by name as in JAX's dictionaries."""
     t, q = as_time(t), as_coordinates(scene, q)
     named = scene.coordinate_names.view(q)
-    return Pose(
-        t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())}
-    )
+    bodies = sorted(bodies_of(scene, t, named).items())
+    return Pose(t, named, {name: BodyPose(name, body) for name, body in bodies})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Return poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the
-    scene's inputs (default: zero), or `ChangingInputs`.
+    """Return poses and velocities (inertial frame) of all bodies at one instant.
+
+    `inputs`: values of the scene's inputs (default: zero), or `ChangingInputs`.
     """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs(t) if isinstance(inputs, ChangingInputs) else inputs, q.dtype)
@@ -88,7 +89,7 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
-    """Return the shapes of the values of `look(scene, motion)` by a trace only; with numbers, JAX would
+    """Return the shapes of the values of `look(scene, motion)`, by a trace only: with numbers, JAX would
     compile each operation.
     """
     numbers = [

@@ -2,8 +2,8 @@
 
     d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
 
-It gives M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, `h = d/dt(dT/dqdot) at qddot = 0
-- dT/dq`. Source: Wang and Pao (2003), eq. (11).
+They give M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, and h is `d/dt(dT/dqdot) -
+dT/dq` at qddot = 0. Source: Wang and Pao (2003), eq. (11).
 """
 
 import jax

@@ -1,11 +1,11 @@
 """The smallest change that removes the residual of constraints, and its derivative in closed form.
 
-    x = K r:   |D (A x - r)| least, and among such x' M x least          K = C L'^-1 (D A C L'^-1)+ D,   C M C = L L'
+    min |D (A x - r)|, then min x' M x:      x = K r,   K = C L'^-1 (D A C L'^-1)+ D,   C M C = L L'
     dx = K (dr - dA x) + K D^-2 K' dA' D^2 (r - A x) + (1 - K A) M^-1 (dA' mu - dM x),   M x = A' mu
 
-C, D: diagonal scales of the unknowns and of the rows, constant under differentiation; A, M, x: of the free
-unknowns. The second term counts if constraints contradict each other. Source: as in `calculus/matrices.py`,
-in the metric M.
+x, A, M: change of the free unknowns, Jacobian of the constraints, metric; r: residual; C, D: diagonal scales
+of the unknowns and of the rows, constant under differentiation. The second term of dx is zero unless
+constraints contradict each other. Source: as in `calculus/matrices.py`, in the metric M.
 """
 
 from typing import NamedTuple
@@ -39,13 +39,15 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """Return the least change of the `free` entries, in the metric `M`, that removes the residual r. Without
-    `M` the metric is Euclidean in the coordinates; a singular `M` is replaced by the identity.
+    """Return the least change of the `free` entries, in the metric `M`, that removes the residual r. It is
+    differentiable in any mode at constant rank.
 
-    `typical`: lengths of the rows, in scaled speeds if there is a metric, relative to which a row counts as
-    vanishing (default: only zero rows do). Rows count as dependent below `cutoff` (default: `rank_cutoff`).
-    Differentiable in any mode at constant rank. `determined`: the constraints can be satisfied and determine
-    all free entries, so that only the first term of the derivative remains.
+    - `M`: None for the Euclidean metric of the coordinates. The identity replaces a singular `M`.
+    - `typical`: typical lengths of the rows, in scaled speeds with a metric; a row that is round-off beside
+      its length counts as zero (default: no row does).
+    - `cutoff`: relative size of singular values below which rows count as dependent (default: `rank_cutoff`).
+    - `determined`: whether the constraints can be satisfied and determine all free entries. Only the first
+      term of the derivative then remains.
     """
     x, K = _least_change(
         (A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined
@@ -69,9 +71,8 @@ def _solved(A, r, M, free, typical, cutoff) -> _Solved:
         W = A * c
     else:
         c = speed_scale(M)
-        L, definite = cholesky(
-            jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(len(c), dtype=c.dtype))
-        )
+        both, one = free[:, None] & free, jnp.eye(len(c), dtype=c.dtype)
+        L, definite = cholesky(jnp.where(both, c[:, None] * M * c, one))
         c = jnp.where(free, c, 0.0)
         W = jax.scipy.linalg.solve_triangular(L, (A * c).T, lower=True).T
     d = row_scale(W, typical)
@@ -109,8 +110,7 @@ def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
         pull = jnp.zeros_like(x)
         pull = pull if dA is None else pull + dA.T @ mu
         pull = c * (pull if dM is None else pull - jnp.where(definite, dM @ x, 0.0))
-        moved = c * (
-            pull if L is None else jax.scipy.linalg.cho_solve((L, True), pull)
-        )  # M^-1 (dA' mu - dM x)
+        # M^-1 (dA' mu - dM x)
+        moved = c * (pull if L is None else jax.scipy.linalg.cho_solve((L, True), pull))
         dx += moved - K @ (A @ moved)
     return Change(x, K), Change(dx, jnp.zeros_like(K))

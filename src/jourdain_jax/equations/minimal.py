@@ -1,13 +1,13 @@
 """Appell's equations in the minimal state (q, y), y the privileged speeds, for constraints linear or affine
 in the speeds.
 
-    u    = C y + c                     from the rows themselves, which so hold exactly                   (25)-(31)
+    u    = C y + c                     from the constraints, which hold exactly                      (25)-(31)
     udot = C ydot + c'                 from their rates
-    C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
+    C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy               (41)
 
 A, C and the partial velocities do not depend on u. They are computed once, at `u = (y, 0)`, and serve both
-levels. A holds only the requested rows: without rows that follow from the others A_z is square, and its
-determinant changes sign where it is singular. Source: Wang and Pao (2003), sections III and IV.
+levels. A has only the rows that were requested. Without redundant rows A_z is square, and its determinant
+changes sign where it is singular. Source: Wang and Pao (2003), sections III and IV.
 """
 
 import equinox as eqx

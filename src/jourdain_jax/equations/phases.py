@@ -1,13 +1,13 @@
 """Contacts that fly, roll, slip and strike: the end of each phase, and the next one.
 
-    M du/dt = h + A' L
+    M du/dt = h + A' L       L: forces,  w = dg/dt and slip,  n, t: normal and tangential parts,  s: `SLOW`
 
     flies       L = 0
-    rolls       dw = 0
-    slips       dw_n = 0,  L_t = -mu L_n e,  e along w_t
+    rolls       dw/dt = 0
+    slips       dw_n/dt = 0,  L_t = -mu L_n e,  e along w_t
     creeps      slips more slowly than s
 
-    ends        normal          tangent                      speed
+    event       normal          tangent                      speed
     flies       gap
     rolls       L_n             (mu_s L_n)^2 - |L_t|^2
     slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
@@ -15,9 +15,9 @@
 
 The event `speed` also ends the motion of a disc or wheel that falls flat.
 
-The direction of slip e is part of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e (`slip_turns`), so
-that errors of w_t across e do not turn it. The rate has no limit at rest: below the speed s, s replaces
-e.w_t.
+Each value is the event that ends the phase when it falls through zero. The direction of slip e is part of the
+state with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e turned by a right angle (`slip_turns`). Errors of w_t
+across e therefore do not turn it. The rate has no limit at rest: below the speed s, s replaces e.w_t.
 
 Impacts: `impacts.py`.
 """
@@ -37,8 +37,8 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.contact.friction_contacts import CREEPS, FLAT, FLIES, PAINLEVE, ROLLS, SLIPS
 from jourdain_jax.scene.modes import Event
 
-NEARLY = 1e-4  # share of the ground's response left near Painleve's paradox
-STOPS = 1e-13  # m/s: slip against its direction by this much ends it, beyond the round-off at its start
+NEARLY = 1e-4  # least share of the ground's response that friction leaves; Painleve's paradox is at zero
+STOPS = 1e-13  # m/s: slip ends at this speed against its direction, which exceeds the round-off at its start
 SAME = 1e-12  # m: a contact that closes within this gap strikes together with another
 TOUCHES = 1e-8  # m: a gap below this counts as closed at the start
 
@@ -66,7 +66,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
 
 
 def contact_changes(at: At) -> dict[str, Event]:
-    """Return the state and the modes after each event of the switching contacts."""
+    """Return an event, with the state and the modes afterwards, for each event of the switching contacts."""
     events = {}
     for i, name in enumerate(at.scene.switching.contacts):
         number, own = at.number[i], jnp.arange(len(at.number)) == i
@@ -75,8 +75,8 @@ def contact_changes(at: At) -> dict[str, Event]:
         flying = strikes & (at.number == FLIES) & together
         after = After(at, i, Changes(flying, own & stops, own & (number == ROLLS)))
         events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
-        # when slip starts, take the direction from the law at rest, even if round-off would let the contact
-        # stick
+        # at the start of slip the law at rest gives the direction, even if the contact would stick by
+        # round-off
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
         ends = jnp.asarray(float(PAINLEVE))
@@ -99,10 +99,8 @@ def _event(
     """Return an event. If speeds jump, all modes come from `after`; otherwise contact i gets `mode`."""
     at, i, names = after.at, after.i, after.at.scene.switching.contacts
     numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(mode))
-    u, e = (
-        jnp.where(jumps, after.u, at.motion.u.array if u is None else u),
-        jnp.where(jumps, after.e, at.modes.direction.at[i].set(e)),
-    )
+    u = jnp.where(jumps, after.u, at.motion.u.array if u is None else u)
+    e = jnp.where(jumps, after.e, at.modes.direction.at[i].set(e))
     e = jnp.where((numbers >= SLIPS)[:, None], e, 0.0)
     directions = {f"{name}_slip_{k}": e[j, k - 1] for j, name in enumerate(names) for k in (1, 2)}
     jump = dict(zip(at.scene.speed_names.entries, u, strict=True)) | directions
@@ -110,8 +108,8 @@ def _event(
 
 
 def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
-    """Return coordinates on the ground, by one Gauss-Newton step, and speeds that satisfy the laws of closed
-    contacts.
+    """Return coordinates on the ground, with directions of slip e of length one, and speeds that satisfy the
+    laws of closed contacts.
 
         q - D' (D D')^-1 gap,  D = d gap/dq;       e/|e|;       u by `_speeds_on_rows`
     """
@@ -129,10 +127,10 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 
 
 def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
-    """Return `u + M^-1 A' T P`, `(T G T + 1 - T) P = -T w`, for contacts in these modes.
+    """Return `u + M^-1 A' T P` with `(T G T + 1 - T) P = -T w`, for contacts in these modes.
 
-    T projects w onto its part that must vanish: the normal part of closed contacts, all slip of rolling ones,
-    and slip across e of slipping ones.
+    T projects the speeds w onto the parts that must vanish: normal speeds of closed contacts, slip of rolling
+    contacts, and slip across e of slipping contacts.
     """
     found, blocks = at.found, []
     for closed, rolls, e, slips in zip(*at.modes, number == SLIPS, strict=True):

@@ -2,9 +2,8 @@
 
     q <- q - G+ g(q),  G = dg/dq               u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-Each iterates to a fixed point and is differentiable in any mode; the iteration and its derivative converge
-quadratically. One step suffices for constraints affine in the speeds. Unit norms of quaternions count as
-geometric constraints here.
+Both iterations, and their derivatives in any mode, converge quadratically. One step suffices for constraints
+affine in the speeds. Unit norms of quaternions count as geometric constraints here.
 """
 
 from collections.abc import Callable
@@ -32,7 +31,7 @@ class RowFunctions(NamedTuple):
     closures: Callable  # (scene, t, q) -> g, G
     rows: Callable  # (scene, t, q, u, inputs) -> phi, A
     masses: Callable  # (scene, t, q) -> M
-    parameters: Callable | None = None  # scene -> argument of the first two functions in its place
+    parameters: Callable | None = None  # scene -> first argument of `closures` and `rows`; None: the scene
 
     def given(self, scene: Scene):
         """Return the first argument of `closures` and `rows`, from a scene."""
@@ -53,9 +52,8 @@ def linearised_rows(
     scene: Scene, t, q, u, inputs
 ) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
     """Return phi and A = d phi/du."""
-    return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(
-        lambda u: velocity_residual(scene, t, q, u, inputs)
-    )(u)
+    phi = lambda u: velocity_residual(scene, t, q, u, inputs)
+    return phi(u), jax.jacfwd(phi)(u)
 
 
 BY_AUTODIFF = RowFunctions(_closures, linearised_rows, mass_matrix_at)
@@ -74,8 +72,8 @@ def project_positions(
     """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
-    `typical`: lengths of the rows relative to which a row counts as vanishing, from `closure_lengths`
-    (default: only zero rows do). `by`: the evaluation of the constraints.
+    `typical`: typical lengths of the rows of G, from `closure_lengths`; a row that is round-off beside its
+    length counts as zero (default: no row does). `by`: the evaluation of the constraints.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
@@ -93,7 +91,9 @@ def project_positions(
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
-    """Return `q / |q|` for every quaternion, the result for unit norms only, without iteration."""
+    """Return `q / |q|` for every quaternion: the projection without other constraints, and without
+    iteration.
+    """
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
         squared = wxyz @ wxyz
@@ -120,13 +120,13 @@ def project_speeds(
     """Return the speeds that satisfy the velocity constraints, nearest to u in the metric of the mass matrix;
     only `free` speeds change.
 
-    - Rows count as dependent below `cutoff` (default: `rank_cutoff`).
-    - `typical`: lengths of the rows in scaled speeds relative to which a row counts as vanishing, from
-      `usual_rows` (default: only zero rows do).
-    - `affine`: the constraints are affine in the speeds, so that one step is exact and `iterations` has no
-      effect.
-    - `determined`: they are affine and determine all `free` speeds, so that no metric is needed; `typical` is
-      then in plain speeds.
+    - `cutoff`: relative size of singular values below which rows count as dependent (default: `rank_cutoff`).
+    - `typical`: typical lengths of the rows in scaled speeds, from `usual_rows`; a row that is round-off
+      beside its length counts as zero (default: no row does).
+    - `affine`: whether the constraints are affine in the speeds. One step is then exact, and `iterations` has
+      no effect.
+    - `determined`: whether affine constraints determine all `free` speeds. There is then no metric, and
+      `typical` is in plain speeds.
     - `by`: the evaluation of constraints and mass matrix.
     """
     if not names_of_rows(scene):

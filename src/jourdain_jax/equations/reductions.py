@@ -8,9 +8,9 @@
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
 - `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
 
-All agree to round-off where they apply; `applicable` is the test. Undetermined accelerations (no inertia
-along a free direction) are NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All
-allow dependent constraints: the rank is found at every state, and the multipliers have minimum norm.
+All agree to round-off where they apply; `applicable` is the test. Without inertia along a free direction,
+accelerations are NaN. `Multipliers` is an exception: its test is too coarse near a loss of rank. All allow
+dependent constraints: the rank is found at every state, and the multipliers have minimum norm.
 """
 
 import abc
@@ -35,10 +35,10 @@ from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
-# Of the scaled A_z. Round-off grows as the inverse square of the pivot: at 1e-2, accelerations agree to 1e-12
-# with the other reductions.
+# Least pivot of the scaled A_z. Round-off grows as the inverse square of the pivot: at 1e-2, accelerations
+# agree to 1e-12 with the other reductions.
 APPLICABLE_PIVOT = 1e-2
-SMALLEST_PIVOT = 1e-3  # below it, privileged speeds are not used as the state of a simulation either
+SMALLEST_PIVOT = 1e-3  # least pivot for privileged speeds as the state of a simulation
 
 
 class Reduction(eqx.Module):
@@ -76,8 +76,8 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
-    """Return the last singular value within the usual rank, which vanishes at a loss of rank. If that rank is
-    unknown, return the smallest value above the cut-off; 1 if there is none.
+    """Return the last singular value within the usual rank, which vanishes at a loss of rank. For an unknown
+    rank, return the smallest value above the cut-off, or 1 without any.
     """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
@@ -110,9 +110,11 @@ class Privileged(Reduction):
     """Appell's equations in privileged velocities: the speeds `independent` are free, and the constraints
     determine the others.
 
-    `zdot = B ydot + b` with `B = -A_z^-1 A_y`. With C from `udot = C yddot + c`, `C' (M (C yddot + c) + h -
-    Q) = 0`. Rows may be redundant if they are so at every state; A_z is then tall, with full column rank. The
-    reduction does not apply where A_z loses rank.
+        udot = C yddot + c        zdot = B ydot + b in order, with B = -A_z^-1 A_y
+        C' (M (C yddot + c) + h - Q) = 0
+
+    Rows that are redundant at every state are allowed: A_z is then tall, with full column rank. The reduction
+    does not apply where A_z loses rank.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)
@@ -171,17 +173,16 @@ class Partition(eqx.Module):
         return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
 
     def signed_pivot(self) -> Scalar:
-        """Return the pivot with the sign of det A_z if A_z is square. A change of this sign along a motion
-        shows that A_z was singular in between.
+        """Return the pivot with the sign of det A_z if A_z is square. If the sign changes along a motion, A_z
+        was singular in between.
         """
         return self.pivot() * self.orientation()
 
     def orientation(self) -> Scalar:
         """Return the sign of det A_z, or 1 if A_z is not square; it has no derivative."""
-        square = self.A.shape[0] == len(self.dependent) > 0
-        return (
-            jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
-        )
+        if self.A.shape[0] == len(self.dependent) > 0:
+            return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0]
+        return jnp.ones((), self.A.dtype)
 
     @property
     def _A_z(self):
@@ -209,8 +210,8 @@ class NullSpaceQR(Reduction):
     `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
 
     It applies wherever `Z'MZ` is positive definite. The result does not depend on the choice of Z, since `F -
-    m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: scaled rows count as dependent below this
-    fraction (default: round-off, `rank_cutoff`).
+    m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: relative size of singular values below
+    which scaled rows count as dependent (default: round-off, `rank_cutoff`).
     """
 
     cutoff: float | None = eqx.field(static=True, default=None)
@@ -232,18 +233,18 @@ class NullSpaceSVD(Reduction):
 
 
 def _refined(inverse, A, b):
-    """Return `A+ b` after one step of iterative refinement, which recovers the two digits lost by an explicit
-    inverse.
+    """Return `A+ b` with one step of iterative refinement, which recovers the two digits that an explicit
+    inverse loses.
     """
     x = inverse @ b
     return x + inverse @ (b - A @ x)
 
 
 class Multipliers(Reduction):
-    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated
-    for dependent rows; (68)-(70).
+    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]` with
+    `f = Q - h` and `b = -drift`, solved by a pseudo-inverse for dependent rows; (68)-(70).
 
-    With `f = Q - h`, `b = -drift`. M may be singular if every admissible velocity has inertia.
+    M may be singular if every admissible velocity has inertia.
     """
 
     name = "multipliers (KKT)"
@@ -258,11 +259,11 @@ class Multipliers(Reduction):
 
 
 class UdwadiaKalaba(Reduction):
-    """Gauss's least constraint: `udot = a + M^-1/2 (A M^-1/2)+ (b - A a)`, `a = M^-1 f`. Needs a positive
-    definite M.
+    """Gauss's least constraint: `udot = a + M^-1/2 (A M^-1/2)+ (b - A a)` with `a = M^-1 f`, `f = Q - h`,
+    `b = -drift`, for positive definite M.
 
-    Source: F. E. Udwadia and R. E. Kalaba, Proc. R. Soc. A 439 (1992) 407, with the Cholesky factor in place
-    of the square root.
+    Source: F. E. Udwadia and R. E. Kalaba, Proc. R. Soc. A 439 (1992) 407, here with the Cholesky factor
+    instead of the square root.
     """
 
     name = "Udwadia-Kalaba (Gauss)"

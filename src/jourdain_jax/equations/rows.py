@@ -85,15 +85,16 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
 
 
 def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
-    """Return the velocity (m/s) of a contact's body at its point relative to the ground, along both tangents."""
-    return contact.plane.tangents @ (
-        motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
-    )
+    """Return the velocity (m/s) of a contact's body relative to the ground at its point, along both
+    tangents.
+    """
+    v, ground = motion[contact.body].velocity_at(contact.point), contact.plane.velocity_at(contact.point)
+    return contact.plane.tangents @ (v - ground)
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
-    """Return rates of named `values` of a pose along the velocities of the motion, differentiable with
-    respect to the velocity of a single body.
+    """Return rates of named `values` of a pose along the motion, as functions of the velocities of the
+    bodies.
     """
 
     names: list[str] = []
@@ -117,7 +118,7 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """Return one name per scalar row: the name of its constraint, indexed if the constraint has several rows."""
+    """Return one name per scalar row: the name of its constraint, with an index if this has several rows."""
     names: list[str] = []
     for name, value in rows.items():
         names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]

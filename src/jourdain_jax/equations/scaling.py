@@ -1,10 +1,10 @@
 """Scaling before rank decisions: speeds by their inertia, constraint rows by their length.
 
-    M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/max(|A_s c|, l_s)
+    M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w
+    c_i = M_ii^(-1/2),   d_s = 1/max(|A_s c|, l_s)        l_s: typical length of row s (`structure_of`)
 
-l_s: the typical length of the row (`structure_of`), so that round-off of a row that vanishes at a
-configuration is not scaled up. The scales are constant under differentiation: the accelerations do not depend
-on them.
+With l_s, the round-off of a row that vanishes at a configuration is not scaled up. The scales are constant
+under differentiation, because the accelerations do not depend on them.
 """
 
 import equinox as eqx
@@ -40,11 +40,11 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
 def row_scale(
     A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None
 ) -> Float[Array, "rows"]:
-    """Return one over the length of each row, or over its `typical` length if that is longer; 1 for a
-    vanishing row without a typical length.
+    """Return the reciprocal length of each row, or of its `typical` length if that is longer; 1 for a zero
+    row without a typical length.
 
-    A row that shrinks along a motion therefore counts less and less, and not at all once it is round-off
-    relative to its typical length.
+    A row that shrinks along a motion thus counts less and less. It counts as zero once it is round-off beside
+    its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
     if typical is not None:

@@ -51,34 +51,28 @@ def has_load_without_potential(scene: Scene) -> bool:
 
 @once_per_class
 def names_of_invariants(scene: Scene) -> tuple[str, ...]:
-    """Return the sorted names of the scene's invariants. A motion needs none of them, so errors in
-    `invariants` are raised only when their names are read.
+    """Return the sorted names of the scene's invariants. Motions do not call this, so errors in `invariants`
+    appear only when invariants are used.
     """
     return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
 
 
 @once_per_class
 def _listed(scene: Scene) -> _Listed:
-    """Return the names, recorded during the trace because JAX returns only arrays, in dictionaries sorted by
-    name.
+    """Return the names. They are recorded during the trace, because JAX returns only arrays and sorts
+    dictionaries by name.
     """
     noted: list[_Listed] = []
 
     def look(scene: Scene, motion: Motion) -> None:
-        rows, first = (
-            tuple(row_names(found))
-            for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose()))
-        )
-        without = bool(scene.switching.contacts) or any(
-            load.potential is None for load in loads_of(scene, motion)
-        )
-        stop = {name: event.stop for name, event in events_of(scene, motion).items()} | dict.fromkeys(
-            scene.switching.events, False
-        )
-        events = tuple(sorted(stop))
-        noted.append(
-            _Listed(tuple(motion.bodies), rows, first, events, tuple(stop[name] for name in events), without)
-        )
+        rows = row_names(velocity_rows(scene, motion))
+        first = row_names(position_rows(scene, motion.pose()))
+        without = any(load.potential is None for load in loads_of(scene, motion))
+        without = without or bool(scene.switching.contacts)
+        stop = {name: event.stop for name, event in events_of(scene, motion).items()}
+        stop |= dict.fromkeys(scene.switching.events, False)
+        events, ends = zip(*sorted(stop.items()), strict=True) if stop else ((), ())
+        noted.append(_Listed(tuple(motion.bodies), rows, first, events, ends, without))
 
     shapes_along_motion(look, scene)
     return noted[0]

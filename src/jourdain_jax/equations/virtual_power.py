@@ -1,13 +1,15 @@
 """Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible virtual
 velocity.
 
-    sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k  =  M udot + h - Q        (50), (56)
+    sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k
+        =  M udot + h - Q                                                                         (50), (56)
 
     M = sum m beta' beta + gamma' I gamma
-    h = sum m beta' a_0 + gamma' (I alpha_0 + omega x I omega)          (h from a second directional derivative, never from dM/dq)
+    h = sum m beta' a_0 + gamma' (I alpha_0 + omega x I omega)
     Q = sum beta' F + gamma' L + Q_direct - N' dV/dq
 
-Source: Wang and Pao (2003), eqs. (18), (50), (56). Angular quantities in body axes.
+a_0, alpha_0 in h come from a second directional derivative, never from dM/dq. Angular quantities are in body
+axes. Source: Wang and Pao (2003), eqs. (18), (50), (56).
 """
 
 import equinox as eqx
@@ -221,39 +223,33 @@ class ContactResponse(eqx.Module):
 def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     """Return the response of switching contacts to their forces at the state of a motion.
 
-    M (impulses, free) = (A', Q - h) + A_p' (multipliers, so that A_p impulses = 0 and A_p free = -drift_p)       A_p: rows that always hold
+        M (impulses, free) = (A', Q - h) + A_p' multipliers,   A_p impulses = 0,   A_p free = -drift_p
+
+    A_p, drift_p: of the constraints that always hold.
     """
     instant = instant_at(scene, motion.t, motion.q.array, motion.u.array, motion.inputs.array)
-    equations, held, rows = (
-        equations_of(scene, instant, loads_of(scene, motion)),
-        rows_of(scene, instant),
-        contact_rows(scene, motion),
-    )
+    equations = equations_of(scene, instant, loads_of(scene, motion))
+    held, rows = rows_of(scene, instant), contact_rows(scene, motion)
     count, kept = len(motion.u.array), len(held.phi)
     right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
-    # the last speeds first: they belong to the leaves of a tree, and elimination from there creates no
-    # fill-in
+    # the last speeds, of the leaves of a tree of bodies, come first: their elimination creates no fill-in
     moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]
     if kept:
-        by_rows, drift = (
-            moved[:, len(moved[0]) - kept :],
-            jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1),
-        )
+        by_rows = moved[:, len(moved[0]) - kept :]
+        drift = jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1)
         moved = moved[:, : len(moved[0]) - kept]
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
     # a constraint that holds up to a force has unit normal force, the solution of L_n - 1 = 0
-    one = jnp.array(
-        [[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()], free.dtype
-    ).ravel()
-    return ContactResponse(
-        rows, impulses, rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one
-    )
+    held_rows = [[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()]
+    one = jnp.array(held_rows, free.dtype).ravel()
+    G, b = rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one
+    return ContactResponse(rows, impulses, G, b)
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
-    """Return the modes of the switching contacts and their directions of slip, which are part of the state;
-    zero unless a contact slips or creeps.
+    """Return the modes of the switching contacts and their directions of slip, which are part of the state.
+    The direction is zero unless a contact slips or creeps.
     """
     names = scene.switching.contacts
     number = jnp.stack([motion.modes[name] for name in names])
@@ -267,7 +263,7 @@ def contact_modes(scene: Scene, motion: Motion) -> Modes:
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
-    """Return rates of the directions of slip, 1/s; zero unless a contact slips or creeps.
+    """Return rates of the directions of slip e, 1/s; zero unless a contact slips or creeps.
 
     de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
     """
@@ -295,8 +291,8 @@ def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Fl
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:
-    """Return the loads of a scene, including the forces of switching contacts, which depend on the other
-    loads; `found`: the contacts' response, if already known.
+    """Return the loads of a scene and the forces of its switching contacts, which depend on the other loads.
+    `found`: the contacts' response, if already known.
     """
     own = loads_of(scene, motion)
     if not scene.switching.contacts:
@@ -306,8 +302,8 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
-    """Return all impressed forces, torques in body axes, and forces on the speeds, including `-N' dV/dq` of
-    the scene's own potential; `loads`: as in `resultants`.
+    """Return all impressed forces, torques (body axes), and forces on the speeds, with `-N' dV/dq` of the
+    scene's own potential. `loads`: as in `resultants`.
     """
     total = resultants(scene, motion, loads=loads)
     orientation = of_bodies(motion, "orientation")
@@ -326,16 +322,15 @@ def _potential_gradient(scene: Scene, motion: Motion) -> Speeds:
 
 
 def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Scalar:
-    """Return the residual of Jourdain's variational equation (18): `sum (m a - F) . delta_1 v = delta u . (M
-    udot + h - Q)`, in W.
+    """Return the residual of Jourdain's variational equation (18), in W:
+
+        sum (m a - F) . delta_1 v = delta u . (M udot + h - Q)
 
     `udot`: the accelerations; `virtual_velocity`: any `delta u`, shape (speeds,). `inputs`: values of the
-    scene's inputs (default: zero). The residual is zero for every virtual velocity with `A delta u = 0` if
-    and only if `udot` is the constrained acceleration.
+    scene's inputs (default: zero). The constrained accelerations, and no others, have a zero residual for
+    every virtual velocity with `A delta u = 0`.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
-    udot, virtual_velocity = (
-        as_speeds(scene, udot, "udot"),
-        as_speeds(scene, virtual_velocity, "virtual_velocity"),
-    )
+    udot = as_speeds(scene, udot, "udot")
+    virtual_velocity = as_speeds(scene, virtual_velocity, "virtual_velocity")
     return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)

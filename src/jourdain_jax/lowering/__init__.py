@@ -2,6 +2,6 @@
 
     scene -> jaxpr -> graph of scalars -> elimination of the constraints -> normal forms -> straight-line code
 
-Structural zeros and ones, which XLA cannot remove from products of dense matrices, vanish here; so do
-coordinates on which nothing depends. Open `lower.py` first, then `appell.py`.
+This removes structural zeros and ones, which XLA keeps in products of dense matrices, and coordinates on
+which nothing depends. Open `lower.py` first, then `appell.py` and `partial_velocities.py`.
 """

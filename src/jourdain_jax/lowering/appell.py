@@ -1,13 +1,13 @@
 """Jourdain's equations in independent speeds: rates of the minimal state (q, y) as scalar expressions.
 
-    A_z z = -(A_y y + phi_0)                         dependent speeds, by elimination                     (25)-(31)
-    v, omega;  beta, gamma = d(v, omega)/dy;  a_0, alpha_0 along the motion at ydot = 0
-    M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
-    M ydot = f                                                                                             (41), (50), (56)
+    A_z z = -(A_y y + phi_0)                       dependent speeds, by elimination               (25)-(31)
+    beta, gamma = d(v, omega)/dy                   a_0, alpha_0: accelerations at ydot = 0
+    M = sum m beta' beta + gamma' I gamma
+    f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
+    M ydot = f                                                                             (41), (50), (56)
 
-Constraints that are not eliminated are kept (`kept_rows.py`). There are two strategies.
-*Explicit*: substitute z(q, y) into the velocities before differentiating them, best if z is simple.
-*Implicit*: differentiate the velocities as they are, with zdot from the differentiated constraints.
+Constraints that are not eliminated are kept (`kept_rows.py`). `partial_velocities.py` computes beta, gamma,
+a_0 and alpha_0 by one of two strategies.
 """
 
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
 class Strategy:
     """Strategy for building the equations; all strategies give equal values."""
 
-    explicit: bool = True
+    explicit: bool = True  # as in `Kinematics`
     most_terms: int = 0  # limit of a normal form; 0: no normal forms
     most_terms_of_equations: int = 0  # the same for the entries of M and f
     by_determinants: bool = False  # accelerations by Cramer's rule, with dependent speeds as symbols
@@ -43,17 +43,10 @@ class Strategy:
     @property
     def description(self) -> str:
         """Describe the strategy for the summary."""
-        way = (
-            "dependent speeds substituted before differentiation"
-            if self.explicit
-            else "constraints differentiated through body velocities"
-        )
-        solved = (
-            "accelerations by determinants in normal form"
-            if self.by_determinants
-            else "accelerations by elimination"
-        )
-        return f"{way}, {solved}"
+        way = "constraints differentiated through body velocities"
+        way = "dependent speeds substituted before differentiation" if self.explicit else way
+        solved = "determinants in normal form" if self.by_determinants else "elimination"
+        return f"{way}, accelerations by {solved}"
 
 
 @dataclass
@@ -124,11 +117,8 @@ class AppellOnGraph:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(Kinematics(self, forms, {}, explicit=False), ydot)
-            power = (
-                power
-                if equal(self.identity_probes([power]), self.identity_probes([true_power])).all()
-                else true_power
-            )
+            if not equal(self.identity_probes([power]), self.identity_probes([true_power])).all():
+                power = true_power
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
         return Equations(
             qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares
@@ -136,24 +126,22 @@ class AppellOnGraph:
 
     def _of_state(self, resets: np.ndarray) -> NodeList:
         """Return the state changes at events, without dependent speeds."""
+        if not resets.size:
+            return []
         first = len(self.traced.q)
-        return (
-            np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist()
-            if resets.size
-            else []
-        )
+        return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist()
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
     def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[NodeList, NodeList]:
         """Return coordinates projected onto quaternion norms and geometric constraints, and speeds projected
-        onto velocity constraints (empty if eliminated). Closed contacts count as constraints.
+        onto velocity constraints (none if these are eliminated). Closed contacts count as constraints.
         """
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        # constraints fix the others, but have derivatives with respect to them
+        # fix only ignorable coordinates that vary; constraints have derivatives with respect to the others
         varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))
         closure = g.substituted(
             closure, unaffected(self.identity_probes, closure, self._at_reference(varying))
@@ -181,8 +169,8 @@ class AppellOnGraph:
         """Return the power of loads without a potential, of explicit time in potentials, of constraints that
         do work, of prescribed poses, and of changing masses.
 
-        `sum (m a - F).v + (I alpha + omega x I omega - L).omega - Q_direct.u + (mdot v.v + omega.(dI/dt
-        omega))/2`
+            traced power + sum (m a - F).v + (I alpha + omega x I omega - L).omega
+                         + sum (mdot v.v + omega.(dI/dt omega))/2 - Q_direct.u
         """
         g, at = self.graph, k.at
         if not self.forces_work:
@@ -190,16 +178,13 @@ class AppellOnGraph:
         terms = [int(at.power)]
         if self.structure.varying_inertia:
             raw = [*self.traced.at.mass.tolist(), *self.traced.at.inertia.ravel().tolist()]
-            mass_rates, inertia_rates = np.split(
-                np.array(k.rates_along_motion(raw), np.int64), [len(at.mass)]
-            )
-            for b, (rate, of_inertia) in enumerate(
-                zip(mass_rates.tolist(), inertia_rates.reshape(-1, 3, 3).tolist(), strict=True)
-            ):
+            rates = np.array(k.rates_along_motion(raw), np.int64)
+            mass_rates, inertia_rates = np.split(rates, [len(at.mass)])
+            pairs = zip(mass_rates.tolist(), inertia_rates.reshape(-1, 3, 3).tolist(), strict=True)
+            for b, (rate, of_inertia) in enumerate(pairs):
                 v, omega = at.v[b].tolist(), at.omega[b].tolist()
-                gained = g.add(
-                    g.mul(rate, g.dot(v, v)), g.dot(omega, [g.dot(row, omega) for row in of_inertia])
-                )
+                by_mass = g.mul(rate, g.dot(v, v))
+                gained = g.add(by_mass, g.dot(omega, [g.dot(row, omega) for row in of_inertia]))
                 terms.append(g.mul(g.const(0.5), gained))
         for b in range(len(at.mass)):
             a = [g.add(a0, g.dot([beta[b][i] for beta in k.beta], ydot)) for i, a0 in enumerate(k.a0[b])]
@@ -223,9 +208,8 @@ class AppellOnGraph:
             g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2]))
             for i in range(3)
         ]
-        return [g.mul(int(at.mass[b]), x) for x in a], [
-            g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)
-        ]
+        force = [g.mul(int(at.mass[b]), x) for x in a]
+        return force, [g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)]
 
     def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> NodeList:
         if by_determinants and 1 <= len(f) <= 3:
@@ -266,15 +250,8 @@ class AppellOnGraph:
         found = solved(left, known)
         known |= {k: row[0] for k, row in zip(left, map(forms.all_simplified, found.solution), strict=True)}
         z = [known[k] for k in self.dependent]
-        return (
-            z,
-            forms.all_simplified(
-                g.substituted(
-                    at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent}
-                )
-            ),
-            found.pivots,
-        )
+        put = {u[k]: n for k, n in known.items() if k not in self.independent}
+        return z, forms.all_simplified(g.substituted(at.qdot.tolist(), put)), found.pivots
 
     def _forms(self, most_terms: int) -> NormalForms:
         squares: dict[int, Polynomial] = {}
@@ -297,10 +274,8 @@ class AppellOnGraph:
             )
         for b, mass in enumerate(at.mass.tolist()):
             beta, gamma = [k.beta[i][b] for i in freedoms], [k.gamma[i][b] for i in freedoms]
-            impressed, resisting = (
-                (at.force[b].tolist(), at.torque[b].tolist()),
-                self._inertia_resultants(at, b, k.a0[b], k.alpha0[b]),
-            )
+            impressed = at.force[b].tolist(), at.torque[b].tolist()
+            resisting = self._inertia_resultants(at, b, k.a0[b], k.alpha0[b])
             force, torque = (
                 [g.sub(F, ma) for F, ma in zip(*pair, strict=True)]
                 for pair in zip(impressed, resisting, strict=True)

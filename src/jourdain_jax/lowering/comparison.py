@@ -1,5 +1,5 @@
-"""Comparison of the rates of two programs, or of a program and dense matrices, at probes where both are valid
-and relative to the typical size of each rate.
+"""Comparison of the rates of two programs, or of a program and dense matrices, at probes where both are
+valid. Differences are relative to the typical size of each rate.
 """
 
 import jax
@@ -35,24 +35,22 @@ def values_at(found: Equations, probes: Probes) -> np.ndarray:
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Return whether two programs agree wherever the second is valid."""
     usable = all_finite(expected, axis=0)
+    error = np.abs(values - expected)[:, usable]
     # tolerance 1e-9, relative to the size of each rate
-    return bool(
-        enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable]))
-    )
+    return bool(enough(usable) and np.all(error <= 1e-9 * _sizes(expected[:, usable])))
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
-    """Return the sizes relative to which errors of rates (first axis) at probes are judged: the usual
-    size of each rate, in its unit.
+    """Return reference sizes for errors of rates (first axis) at probes: the largest value of each rate, and
+    0.01 of the largest rate at the probe, whose round-off elimination spreads over all rates.
     """
     usual = largest(rates, 1, keepdims=True)
-    # plus 0.01 of the largest rate at a probe, because elimination spreads its round-off over all rates
     return usual + 0.01 * largest(rates, 0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
-    """Return whether a program is valid at enough of the probes. For long chains only
-    some satisfy the constraints.
+    """Return whether a program is valid at enough of the probes: for long chains, few satisfy the
+    constraints.
     """
     # at least 12 probes, if so many exist
     return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
@@ -61,7 +59,7 @@ def enough(usable: np.ndarray) -> bool:
 def check_against_dense(
     scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray
 ) -> None:
-    """Raise `NotLowered`, naming the worst rate, if the program differs at the probes from JAX's
+    """Raise `NotLowered` with the name of the worst rate if the program differs, at the probes, from JAX's
     derivatives and a dense solution.
     """
     probes, independent = builder.probes, tuple(builder.independent)
@@ -95,17 +93,12 @@ def check_against_dense(
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
         raise NotLowered("its scalar program is valid at too few of the probed states")
-    # tolerance between the program (in double precision) and the dense path,
-    # relative to the size of each rate
+    # tolerance between the program, in double precision, and the dense path, relative to the size of each
+    # rate
     limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}; {LIKELY}")
-    if found.events and not np.allclose(
-        probes(found.events)[:, chosen][:, usable],
-        events.T[:, usable],
-        rtol=limit,
-        atol=limit,
-        equal_nan=True,
-    ):
+    by_program = probes(found.events)[:, chosen][:, usable] if found.events else events.T[:, usable]
+    if not np.allclose(by_program, events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered(f"the value of a stop event {DIFFERS}")

@@ -1,5 +1,5 @@
-"""Normal forms of switching contacts: contact responses are simplified once; loads, events, resets and
-starts are rebuilt from them.
+"""Normal forms of switching contacts. Their responses are simplified once; loads, events, resets and starts
+then use the simple nodes.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ MOST_TERMS = (8, 60)  # term limits to try
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Replace `responses` by normal forms, including responses at later states, which are functions of
-    earlier ones. `forms`: returns normal forms with a limited number of terms.
+    """Replace `responses` by normal forms. Responses at later states are functions of earlier ones and are
+    replaced, too. `forms`: function from a limit of terms to normal forms.
     """
     g, at = traced.graph, traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]
@@ -24,15 +24,6 @@ def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) 
     for row, nodes in zip(at.responses[1:, : len(state)].tolist(), later, strict=True):
         now = dict(zip(state, g.substituted(row, simple), strict=True))
         simple |= dict(zip(nodes, g.substituted(normal, now), strict=True))
-    for x in (
-        at.force,
-        at.torque,
-        at.direct,
-        at.power,
-        at.events,
-        at.resets,
-        at.slip_turns,
-        at.held,
-        at.start,
-    ):
+    loads = at.force, at.torque, at.direct, at.power
+    for x in (*loads, at.events, at.resets, at.slip_turns, at.held, at.start):
         x[...] = np.array(g.substituted(x.ravel().tolist(), simple), np.int64).reshape(x.shape)

@@ -29,8 +29,8 @@ from jourdain_jax.structure.trace import VelocityQuantities, jaxpr_of_scene
 def dense_rates(
     scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs
 ) -> tuple[np.ndarray, ...]:
-    """Return rates of coordinates and of the independent speeds, and values of the stop events, at many
-    states; NaN if the accelerations are not unique.
+    """Return rates of coordinates, rates of the independent speeds, and values of the stop events at many
+    states. Rates are NaN if the accelerations are not unique.
 
     All arrays, including parameters, have a leading axis of states. `independent`: speeds in the state; the
     constraints determine the others.
@@ -44,10 +44,8 @@ def dense_rates(
         function = jaxpr_as_fun(needed_only(closed, [getattr(numbers, name) for name in names]))
         return lambda scene, t, q, u, inputs: function(*jax.tree.leaves(scene), t, q, u, inputs)
 
-    values, level = (
-        of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events", "slip_turns"),
-        of_state("v", "omega", "phi"),
-    )
+    names = "qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events", "slip_turns"
+    values, level = of_state(*names), of_state("v", "omega", "phi")
 
     def slopes(scene, t, q, u, inputs, *along):
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
@@ -80,11 +78,8 @@ def _rates(
     parted = lambda found: jax.tree.map(lambda x: x.reshape(states, speeds, *x.shape[1:]), found)
 
     u = np.where(np.isin(np.arange(speeds), dependent), 0.0, u)
-    none, still, each = (
-        np.zeros(states * speeds),
-        np.zeros((states * speeds, q.shape[1])),
-        np.tile(np.eye(speeds), (states, 1)),
-    )
+    none, still = np.zeros(states * speeds), np.zeros((states * speeds, q.shape[1]))
+    each = np.tile(np.eye(speeds), (states, 1))
     (_, _, phi), found = parted(slopes(*lanes(parameters, t, q, u, inputs), none, still, each))
     beta, gamma, A = (np.moveaxis(x, 1, -1) for x in found)
     A = A[:, kept]
@@ -93,29 +88,22 @@ def _rates(
         u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
     qdot, omega, force, torque, direct, m, I, events, turns = values(parameters, t, q, u, inputs)
     # with the same batch size, so that JAX traces this once
-    a, alpha, drift = (
-        x[:, 0]
-        for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[
-            1
-        ]
-    )
+    along = np.ones(states), qdot, np.zeros_like(u)
+    rates = parted(slopes(*lanes(parameters, t, q, u, inputs, *along)))[1]
+    a, alpha, drift = (x[:, 0] for x in rates)
     turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)
     force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + direct
-    udot = accelerations(
-        mass_matrix(m, I, beta, gamma), f, A, drift[:, kept], structure.row_lengths[kept], structure.rank
-    )
-    return (
-        np.append(qdot[:, : q.shape[1] - turns.shape[1]], turns, axis=1),
-        udot[:, list(independent)],
-        events,
-    )
+    M, lengths = mass_matrix(m, I, beta, gamma), structure.row_lengths[kept]
+    udot = accelerations(M, f, A, drift[:, kept], lengths, structure.rank)
+    qdot = np.append(qdot[:, : q.shape[1] - turns.shape[1]], turns, axis=1)
+    return qdot, udot[:, list(independent)], events
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
     """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not unique.
 
-    `rank`: rank of the constraints. Smaller eigenvalues are dropped, because coordinates rounded to single
+    `rank`: rank of the constraints. Eigenvalues beyond it are dropped, because coordinates rounded to single
     precision make dependent constraints independent by about 1e-8.
     """
     c = speed_scales(M)
@@ -129,10 +117,8 @@ def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndar
     size, V = np.linalg.eigh(np.where(finite[:, None, None], system, 0.0))
     largest = np.argsort(-np.abs(size), axis=1)[:, : f.shape[1] + rank]
     size, V = np.take_along_axis(size, largest, 1), np.take_along_axis(V, largest[:, None], 2)
-    determined = finite & np.all(
-        np.abs(size) > 16 * V.shape[1] * np.finfo(float).eps * np.abs(size[:, :1]), axis=1
-    )
-    along = (V.mT @ np.where(finite[:, None], right, 0.0)[..., None])[..., 0] / np.where(
-        determined[:, None], size, 1.0
-    )
+    least = 16 * V.shape[1] * np.finfo(float).eps * np.abs(size[:, :1])
+    determined = finite & np.all(np.abs(size) > least, axis=1)
+    along = (V.mT @ np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
+    along = along / np.where(determined[:, None], size, 1.0)
     return np.where(determined[:, None], c * (V @ along[..., None])[:, : f.shape[1], 0], np.nan)

@@ -1,6 +1,6 @@
-"""Probes outside the domain, with angles over full turns, because a pivot that is large in the
-domain may vanish at another heading. Speeds satisfy the velocity constraints, because redundant
-constraints have a solution only there.
+"""Probes outside the domain, with angles over full turns: a pivot that is large in the domain may vanish at
+another heading. Speeds satisfy the velocity constraints, since otherwise redundant constraints have no
+solution.
 """
 
 from collections.abc import Callable
@@ -16,10 +16,11 @@ from jourdain_jax.structure.trace import TracedScene
 
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
-    """Return a function that makes probes with coordinates up to half a turn away from the given ones,
-    projected onto the geometric constraints where that converges. They are made on first use.
+    """Return a function that makes probes, on first use, with coordinates up to half a turn from the given
+    ones.
 
-    Quaternions are drawn anew.
+    They are projected onto the geometric constraints, NaN where this does not converge. Quaternions are
+    random.
     """
     return cache(lambda: _at_full_turns(probes, traced))
 
@@ -50,6 +51,5 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
 
 def on_velocity_rows(probes: Probes, traced: TracedScene) -> Probes:
     """Return the probes with speeds projected onto the velocity constraints."""
-    return onto_rows(
-        probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}
-    ).probes
+    speeds = {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}
+    return onto_rows(probes, traced.at.phi.tolist(), speeds).probes

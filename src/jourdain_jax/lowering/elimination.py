@@ -17,8 +17,8 @@ Rows = list[list[int]]  # of a matrix; each entry is a node
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Solution of `A x_k = b_k` as `solution[column][k]`, and the pivots that may vanish along the
-    motion or for some parameters.
+    """Solution of `A x_k = b_k` as `solution[column][k]`, and the pivots that may vanish along the motion or
+    for some parameters.
     """
 
     solution: Rows
@@ -27,15 +27,13 @@ class Eliminated:
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """Return the probes at which division by these pivots is accurate: none is small
-    relative to its typical size.
-    """
+    """Return the probes at which division by these pivots is accurate: none is far below its typical size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 
 
 def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
-    """Return the median of each value over the probes where it is defined; NaN without any."""
+    """Return the median of each value over the probes at which it is defined; NaN without any."""
     known = np.any(~np.isnan(sizes), axis=1)
     found = np.full(len(sizes), np.nan)
     found[known] = np.nanmedian(sizes[known], axis=1)
@@ -45,10 +43,10 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
 def eliminate(
     graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None
 ) -> Eliminated:
-    """Solve a system. `right[row]` holds the right-hand sides of that row. With more rows than unknowns,
-    the rows must be consistent.
+    """Return the solution of a system. `right[row]`: right-hand sides of a row. More rows than unknowns must
+    be consistent.
 
-    `far`: function that makes probes with angles of up to a full turn, called only if a pivot needs them.
+    `far`: function that returns probes with angles of up to a full turn, called only if a pivot needs them.
     """
     system = Pivots(graph, A, right, probes, far)
     count = len(system.columns)
@@ -58,30 +56,22 @@ def eliminate(
         system.eliminated(order[-1])
     solution: dict[int, list[int]] = {}
     for pivot in reversed(order):
+        known = [
+            [(row[k], x) for k, x in solution.items() if row[k] != graph.zero]
+            for row in (system.A[r] for r in pivot.rows)
+        ]
         rest = [
             [
-                graph.sub(
-                    b,
-                    graph.total(
-                        graph.mul(system.A[r][k], x[j])
-                        for k, x in solution.items()
-                        if system.A[r][k] != graph.zero
-                    ),
-                )
+                graph.sub(b, graph.total(graph.mul(a, x[j]) for a, x in terms))
                 for j, b in enumerate(system.right[r])
             ]
-            for r in pivot.rows
+            for r, terms in zip(pivot.rows, known, strict=True)
         ]
         found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
-        solution |= (
-            dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True))
-            if found
-            else {c: [] for c in pivot.columns}
-        )
-    return Eliminated(
-        [solution[c] for c in range(count)],
-        [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"],
-    )
+        values = map(list, zip(*found, strict=True)) if found else ([] for _ in pivot.columns)
+        solution |= zip(pivot.columns, values, strict=True)
+    monitored = [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"]
+    return Eliminated([solution[c] for c in range(count)], monitored)
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:
@@ -91,7 +81,7 @@ def quotient(graph: Graph, a: int, b: int) -> int:
 
 def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
     """Return `M^-1 right` for a symmetric positive definite M by factorisation L D L'. `right` and the
-    solution consist of columns; the pivots are D.
+    solution have one list per column; the pivots are D.
     """
     count = len(M)
     S, columns = [list(row) for row in M], [list(column) for column in right]

@@ -6,43 +6,15 @@ import numpy as np
 
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
-_IN_C = {
-    "auto",
-    "char",
-    "const",
-    "default",
-    "do",
-    "double",
-    "enum",
-    "extern",
-    "float",
-    "goto",
-    "inline",
-    "int",
-    "long",
-    "register",
-    "restrict",
-    "short",
-}
-_IN_C |= {
-    "signed",
-    "sizeof",
-    "static",
-    "struct",
-    "switch",
-    "typedef",
-    "union",
-    "unsigned",
-    "void",
-    "volatile",
-    "case",
-} | C.names
+_KEYWORDS = """auto case char const default do double enum extern float goto inline int long register restrict
+short signed sizeof static struct switch typedef union unsigned void volatile"""
+_IN_C = C.names.union(_KEYWORDS.split())
 _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
 def summary(lowered) -> str:
-    """Return the summary: operations after each step, omitted parts with reasons, independent speeds, pivots
-    and guards, parameters with units.
+    """Return text: operations after each step, omitted parts with reasons, independent speeds, pivots and
+    guards, parameters with units.
     """
     lines = [
         (
@@ -75,29 +47,24 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """Return short nodes as expressions (up to 8, of at most 60 characters each),
-    and the number of the others.
+    """Return short nodes as expressions (up to 8, of at most 60 characters each), and the number of
+    others.
     """
     names = identifiers(lowered)
-    written = [
-        statements(lowered.graph, [n], names, PYTHON)
-        for n in nodes
-        if len(nodes) <= 8 and not lowered.graph.calls([n])
-    ]
+    few = [n for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
+    written = [statements(lowered.graph, [n], names, PYTHON) for n in few]
     short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= 60]
     more = len(nodes) - len(short)
-    return (
-        ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])])
-        or "none"
-    )
+    others = [f"{more} longer expression{'s' if more > 1 else ''}"] if more else []
+    return ", ".join([*short, *others]) or "none"
 
 
 def _alone(graph, pivot: int) -> int:
     """Return the varying factor of a scaled pivot, or the argument of a sign."""
     args = graph.args[pivot]
-    return (
-        next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
-    )
+    if graph.op[pivot] not in ("mul", "sign"):
+        return pivot
+    return next((a for a in args if graph.varies[a]), args[0])
 
 
 def _speeds(lowered) -> list[str]:
@@ -152,10 +119,9 @@ def results(lowered) -> dict[str, int]:
 
 
 def _prefix(letter: str, names) -> str:
-    """Return a prefix for numbered names that no name of the scene begins with."""
-    return (
-        _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
-    )
+    """Return a prefix of numbered names that are not among the `names`."""
+    taken = any(re.fullmatch(rf"{letter}\d+", name) for name in names)
+    return _prefix(letter + "_", names) if taken else letter
 
 
 def python_source(lowered) -> str:
@@ -215,8 +181,8 @@ def _conventions(lowered) -> str:
 
 
 def c_source(lowered, name: str = "rates") -> str:
-    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)`; it
-    needs the C mathematical library.
+    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)`; it needs the C
+    mathematical library.
     """
     traced, rates = lowered.traced, results(lowered)
     names = {
@@ -232,9 +198,8 @@ def c_source(lowered, name: str = "rates") -> str:
     groups["inputs"] = [int(n) for n in traced.inputs]
     lines, outputs = statements(lowered.graph, list(rates.values()), names, C, _prefix("s", names.values()))
     used = {n for n in lowered.graph.reachable(rates.values()) if n in names}
-    unused = [group for group, nodes in groups.items() if not used.intersection(nodes)] + (
-        [] if traced.t in used else ["t"]
-    )
+    unused = [group for group, nodes in groups.items() if not used.intersection(nodes)]
+    unused += [] if traced.t in used else ["t"]
     signs = (
         ["static inline double sign(double x) { return (x > 0) - (x < 0); }", ""]
         if any("sign(" in text for text in (*lines, *outputs))
@@ -283,8 +248,8 @@ def expressions(lowered) -> dict:
 def latex(lowered) -> str:
     """Return the equations for an `align` environment, with numbers rounded to six digits; requires SymPy.
 
-    A speed that is the rate of a coordinate appears as its derivative and needs no equation
-    of motion for the coordinate.
+    A speed that is the rate of a coordinate appears as the derivative of the coordinate, without an equation
+    of its own.
     """
     import sympy
 
@@ -312,8 +277,8 @@ def latex(lowered) -> str:
 
 
 def _symbol(name: str) -> str:
-    """Return a single Latin or Greek letter in italics, other words upright, each
-    with its number as subscript.
+    """Return a single Latin or Greek letter in italics, other words upright, each with its number as
+    subscript.
     """
     import sympy
 

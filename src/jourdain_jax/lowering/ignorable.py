@@ -1,5 +1,5 @@
-"""Coordinates without influence on the accelerations of the independent speeds; the program
-fixes them at the reference.
+"""Coordinates without influence on the accelerations of the independent speeds; programs fix them at the
+reference.
 """
 
 from dataclasses import replace
@@ -20,10 +20,11 @@ FEW = 6  # number of probes that suffices for most coordinates
 def _with_slopes(
     builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray
 ) -> set[int]:
-    """Return the coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe.
+    """Return the coordinates (nodes) for which `sum w ydot`, with random weights w, has a nonzero derivative
+    at some generic probe. It may change values by less than round-off, as for the heading of the last of many
+    trailers.
 
-    The derivative may be below the round-off of the values, as for the heading of the last of many trailers.
-    Only operations that the identity test evaluates exactly are considered.
+    The set is empty if the derivatives contain operations that the identity test replaces.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
@@ -46,29 +47,25 @@ def _with_slopes(
 def ignorable(
     scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray
 ) -> tuple[int, ...]:
-    """Return the coordinates (quaternions as a whole) whose values never affect the
-    accelerations of the independent speeds.
+    """Return the coordinates (quaternions as a whole) that never affect the accelerations of the independent
+    speeds.
     """
     probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
     attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
     at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    used, here, regular = (
-        set(builder.graph.reachable(equations.ydot)),
-        generic(equations.ydot),
-        pivots_ok(equations.pivots, generic),
-    )
+    used, here = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot)
+    regular = pivots_ok(equations.pivots, generic)
 
     def unchanged(group) -> bool:
         elsewhere = generic.exchanged([[f"q_{i}" for i in group]], np.arange(generic.count))
-        return bool(
-            np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere)))
-        )
+        valid = regular & pivots_ok(equations.pivots, elsewhere)
+        return bool(np.all(equal(elsewhere(equations.ydot), here, valid)))
 
     def surely_changed(groups) -> np.ndarray:
-        """Return which groups of coordinates certainly influence the accelerations. A few probes test all
-        groups at once, which finds nearly all groups of a long chain.
+        """Return which groups of coordinates influence the accelerations at a few probes. All groups are
+        tested at once, which finds nearly all groups of a long chain.
         """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
@@ -79,27 +76,24 @@ def ignorable(
         before.error = here.error[:, lanes]
         sizes = np.abs(elsewhere(equations.pivots))
         # require pivots 100 times above the limit, so that they are valid whatever their typical size
-        far_from_singular = np.all(
-            sizes > 100.0 * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0
-        )
+        typical = usual(np.abs(generic(equations.pivots)))[:, None]
+        far_from_singular = np.all(sizes > 100.0 * SMALLEST_PIVOT * typical, axis=0)
         return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
 
     def regular_at_reference(group) -> bool:
-        values = values_at(
-            accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group})
-        )
+        fixed = {f"q_{i}": np.full(probes.count, reference[i]) for i in group}
+        values = values_at(accelerations, probes.with_inputs(fixed))
         return enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
 
     groups = [*single, *attitudes]
     held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
     groups = [group for group in groups if group[0] not in held]
     left = [group for group, counts in zip(groups, surely_changed(groups), strict=True) if not counts]
-    count_little = _with_slopes(
-        builder, equations.ydot, [q[i] for group in left if len(group) == 1 for i in group], regular
-    )
+    alone = [q[i] for group in left if len(group) == 1 for i in group]
+    count_little = _with_slopes(builder, equations.ydot, alone, regular)
     left = [group for group in left if q[group[0]] not in count_little]
     together = [i for group in left for i in group]
-    # if all together have no effect, neither has any of them
+    # if all together have no effect, none has an effect
     if len(left) > FEW and unchanged(together) and regular_at_reference(together):
         return tuple(sorted([*held, *together]))
     for group in left:

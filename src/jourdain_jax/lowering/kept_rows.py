@@ -1,8 +1,8 @@
-"""Constraints while all speeds stay in the state: enforced by multipliers, or by independent speeds if
-the multipliers are not unique.
+"""Constraints if all speeds are in the state. Multipliers enforce them, or independent speeds y if
+multipliers are not unique:
 
-    A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds
-    C' M C ydot = C' (f - M c)                                                                             (41)
+    A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds z
+    C' M C ydot = C' (f - M c)                                                                         (41)
     z <- z + dz,   A_z dz = -phi(t, q, u)         projection of the speeds
 """
 
@@ -21,8 +21,8 @@ from jourdain_jax.structure.structure import Structure
 
 
 class KeptRows:
-    """Treatment of constraints. `massless`: whether M may be singular. `probes` and, if necessary, `far`:
-    states at which pivots of independent speeds are judged.
+    """Treatment of constraints. `massless`: whether M may be singular; `probes` and, if necessary, `far`:
+    states at which the pivots of independent speeds are judged.
     """
 
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
@@ -55,13 +55,8 @@ class KeptRows:
         if not self.by_partition:
             return projected_speeds(self.graph, self._inertia(M, A), A, u, phi, forms)
         dependent, moved = self._dependent(len(u)), list(u)
-        change = eliminate(
-            self.graph,
-            [[row[k] for k in dependent] for row in A],
-            [[self.graph.neg(n)] for n in phi],
-            self.probes,
-            self.far,
-        ).solution
+        A_z, right = [[row[k] for k in dependent] for row in A], [[self.graph.neg(n)] for n in phi]
+        change = eliminate(self.graph, A_z, right, self.probes, self.far).solution
         for k, (dz,) in zip(dependent, change, strict=True):
             moved[k] = self.graph.add(u[k], dz)
         return moved
@@ -89,12 +84,10 @@ class KeptRows:
         for i in freedoms:
             for j in range(i + 1):
                 inertia[i][j] = inertia[j][i] = forms.simplified(graph.dot(C[i], moved[j]))
-        ydot = solve_symmetric(
-            graph, inertia, [[forms.simplified(graph.dot(column, rest)) for column in C]]
-        ).solution[0]
-        return Accelerations(
-            [graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, []
-        )
+        force = [forms.simplified(graph.dot(column, rest)) for column in C]
+        ydot = solve_symmetric(graph, inertia, [force]).solution[0]
+        udot = [graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds]
+        return Accelerations(udot, found.pivots, [])
 
     def _inertia(self, M: Columns, A: Columns) -> Columns:
         return with_inertia_of_rows(self.graph, M, A, self.probes) if self.massless else M

@@ -1,4 +1,4 @@
-"""Kinks and jumps of loads and masses: relations of the traced scene, with or without a lowered program.
+"""Kinks and jumps of loads and masses, from relations of the traced scene; no lowered program is needed.
 
 Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
 """
@@ -23,8 +23,8 @@ def loads_have_relations(scene: Scene) -> bool:
 
 
 def loads_may_jump(scene: Scene) -> bool:
-    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times are excluded, because
-    derivatives remain correct there.
+    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times do not count:
+    derivatives are correct there.
     """
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
@@ -74,7 +74,6 @@ def _probes(scene: Scene, traced: TracedScene) -> Probes:
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
-    """Return the nodes of loads and masses -> their names."""
-    return owned(
-        scene, **{name: getattr(traced.at, name) for name in ("force", "torque", "mass", "inertia", "direct")}
-    )
+    """Return a dictionary: nodes of loads and masses -> their names."""
+    names = "force", "torque", "mass", "inertia", "direct"
+    return owned(scene, **{name: getattr(traced.at, name) for name in names})

@@ -32,12 +32,12 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.structure.trace import Variables, traced_scene
 
-# Operations of the program before simplification above which the dense path is taken. With XLA, such a
-# program needs a minute more to compile than dense matrices (24 joint angles, 20,762 operations: 71 and 7.5
-# s), though an evaluation takes 0.15 of the time (0.22 in a batch). Smaller programs always beat the dense
-# path (bench/README.md). As machine code larger programs win, too: a quadruped of 20,550 operations takes 11
-# s of processor time to the first motion (dense matrices 50 s), then 0.02 s (5.5 s). Machine code is limited
-# to 60,000 operations, integration steps included.
+# Maximum number of operations of the program before simplification; scenes beyond it use dense matrices. With
+# XLA, a program of this size compiles a minute longer than dense matrices (24 joint angles, 20,762
+# operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (0.22 in a batch). Smaller programs
+# are always faster (bench/README.md). As machine code, larger programs are faster, too: a quadruped of 20,550
+# operations takes 11 s of processor time to the first motion (dense matrices 50 s), then 0.02 s (5.5 s).
+# Machine code is limited to 60,000 operations, integration steps included.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
 
@@ -46,31 +46,18 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     """Return the lowered equations of the scene's class, or the reason why there are none. They are built
     once per class, shapes and independent speeds.
 
-    `every_speed`: whether all speeds stay in the state, with multipliers for the constraints. The default is
-    to do so only if no independent speeds are valid everywhere.
+    `every_speed`: whether all speeds stay in the state, with multipliers for the constraints (default: only
+    if no independent speeds are valid everywhere).
     """
     structure = structure_of(scene)
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
-    kept = (
-        every_speed,
-        None if every_speed else structure.independent,
-        structure.redundant_rows,
-        structure.affine,
-        structure.driven,
-    )
-    kept += (
-        structure.varying_inertia,
-        structure.homogeneous,
-        structure.potentials_of_inputs,
-        structure.may_set_in,
-    )
-    kept += (
-        (structure.dependent_rows, structure.well_conditioned and structure.independent)
-        if every_speed
-        else ()
-    )
+    kept = every_speed, None if every_speed else structure.independent, structure.redundant_rows
+    kept += structure.affine, structure.driven, structure.varying_inertia, structure.homogeneous
+    kept += structure.potentials_of_inputs, structure.may_set_in
+    if every_speed:
+        kept += structure.dependent_rows, structure.well_conditioned and structure.independent
     return _lowered(with_reference_parameters(scene), every_speed, massless, kept)
 
 
@@ -123,24 +110,19 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
             for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist())
         )
         if loop := next(filter(None, loops), None):
-            # measured: a ball on a hill, whose contact point is found by Newton's method, takes four times as
-            # long as with dense matrices
+            # measured: a ball on a hill, with a contact point by Newton's method, takes four times as long as
+            # with dense matrices
             raise Unsupported(f"the operation `{loop}`")
         probes = comparison_probes(scene, structure, traced)
-        # elsewhere redundant constraints contradict each other
+        # off the velocity constraints, redundant ones contradict each other
         if every_speed and len(structure.row_names) > structure.rank:
             probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
-        kept = (
-            KeptRows(traced.graph, structure, massless, probes, far)
-            if every_speed and structure.row_names
-            else None
-        )
-        return _best(
-            scene,
-            structure,
-            AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()),
-        )
+        kept = None
+        if every_speed and structure.row_names:
+            kept = KeptRows(traced.graph, structure, massless, probes, far)
+        reference = scene.coordinates.reference()
+        return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, reference))
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
@@ -174,34 +156,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors extracted", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
-    groups = {
-        name: getattr(best, name)
-        for name in (
-            "qdot",
-            "ydot",
-            "z",
-            "pivots",
-            "directions",
-            "squares",
-            "guards",
-            "power",
-            "events",
-            "resets",
-            "energies",
-        )
-    }
+    names = "qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "resets"
+    groups = {name: getattr(best, name) for name in (*names, "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     pivots = _relative(graph, probes, [*of_rates, *best.pivots])
-    groups |= {
-        "at_start": builder.traced.at.start.tolist(),
-        "power": [best.power],
-        "projected_q": put_q,
-        "projected_u": put_u,
-        "pivots": pivots,
-    }
-    outputs = graph.with_quotients(
-        _with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group])
-    )
+    groups |= {"at_start": builder.traced.at.start.tolist(), "power": [best.power], "pivots": pivots}
+    groups |= {"projected_q": put_q, "projected_u": put_u}
+    every = [n for group in groups.values() for n in group]
+    outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, every))
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
     (power,) = nodes.pop("power")
@@ -215,13 +177,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     nodes["sided"] = sided(graph, every, [*rates, *nodes["events"]], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
-    given = [
-        own.t,
-        *own.q.tolist(),
-        *own.u.tolist(),
-        *own.inputs.tolist(),
-        *(n for x in own.parameters for n in x.ravel().tolist()),
-    ]
+    given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist()]
+    given += [n for x in own.parameters for n in x.ravel().tolist()]
     # without the failed candidates
     alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
     place = places.tolist()
@@ -273,10 +230,8 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
         by_rows = builder.probes(graph.substituted(graph.substituted(found.z, after), true_z))
         if np.any(np.abs(stated - by_rows) > 1e-6 * (1 + np.abs(by_rows))):
             speeds = scene.speed_names.entries
-            free, tied = (
-                ", ".join(f"`{speeds[k]}`" for k in which)
-                for which in (builder.independent, builder.dependent)
-            )
+            both = builder.independent, builder.dependent
+            free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in both)
             raise ValueError(
                 f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity "
                 f"constraints, which determine {tied} from {free}; set all of them consistently, or "
@@ -285,8 +240,8 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
 
 
 def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
-    """Return the divisors in the coordinate rates, such as sin q in w/sin q, except those that a
-    `where` keeps away from zero.
+    """Return the divisors in the coordinate rates, such as sin q in w/sin q. Divisors that a `where` keeps
+    from zero do not count.
     """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
@@ -307,16 +262,15 @@ def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int
     else:
         yield Strategy(False, MOST_TERMS, held=held)
         # try the explicit strategy only up to 5000 operations
-        if (
-            plainly <= 5000
-            and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly
-        ):
+        if plainly > 5000:
+            return
+        if builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
             yield Strategy(True, MOST_TERMS, held=held)
 
 
 def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
-    """Return pivots relative to their values at a probe with the same parameters. For
-    constant pivots, return their signs.
+    """Return pivots relative to their values at a probe with the same parameters; of constant pivots, the
+    signs.
     """
     return [
         graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots
@@ -354,11 +308,11 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeLi
 
 
 def may_be_massless(scene: Scene, structure: Structure) -> bool:
-    """Return whether M is singular at the parameters of `scene`, with traced parameters
-    that may be zero set to zero.
+    """Return whether M is singular at the parameters of `scene`, with traced parameters of zero if they may
+    be zero.
 
-    These are parameters declared `non_negative` or with default zero. If independent speeds are used in any
-    case, all parameters not declared `positive` are set to zero, because that costs nothing.
+    These are parameters declared `non_negative` or with default zero. With well conditioned independent
+    speeds all parameters that are not declared `positive` become zero: a singular M then costs nothing.
     """
     if structure.massless:
         return True
@@ -372,7 +326,7 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
 
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
-    """Return concrete parameters of the scene with all permitted zeros; None if there are none."""
+    """Return the scene with concrete parameters and all permitted zeros; None without any."""
     may_vanish = {
         f.name
         for f in fields(scene)

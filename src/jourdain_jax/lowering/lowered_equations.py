@@ -30,7 +30,7 @@ NODES = (
 
 
 class NotLowered(Exception):
-    """Reason why a scene cannot be lowered."""
+    """Raised with the reason why a scene cannot be lowered."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Lowered:
     pivots: Nodes
     divisors: int  # number of these divisors
     directions: Nodes  # of constraints nonlinear in the speeds, one entry per speed: must not reverse
-    # for each constraint with a multiplier: its remainder beside the earlier ones, and its size;
-    # the ratio is a squared sine
+    # for each constraint with a multiplier: its remainder after elimination of the earlier ones, and its
+    # size; the ratio is a squared sine
     squares: Nodes
     guards: Nodes  # must stay positive
     power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or the integrated part of it)
@@ -104,48 +104,47 @@ class Lowered:
         return self.graph.operations([*self.qdot, *self.ydot])
 
     def summary(self) -> str:
-        """Return operations after each step, omitted parts with reasons, and the chosen independent speeds."""
+        """Return text: operations after each step, omitted parts with reasons, and the independent speeds."""
         return export.summary(self)
 
     def __str__(self) -> str:
         return self.summary()
 
     def python_source(self) -> str:
-        """Return the program as readable Python, in SI units and radians: `fixed(parameters)`
-        and `rates(fixed, t, state)`.
+        """Return the program as readable Python, in SI units and radians: `fixed(parameters)` and
+        `rates(fixed, t, state)`.
         """
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """Return the program as one C function `name`, in SI units and radians,
-        with a comment on its arguments.
+        """Return the program as one C function `name`, in SI units and radians, with a comment on its
+        arguments.
         """
         return export.c_source(self, name)
 
     def expressions(self) -> dict:
-        """Return name -> SymPy expression of every rate; requires SymPy. Use it for small scenes only:
-        expressions of large ones fill pages.
+        """Return name -> SymPy expression of every rate; requires SymPy. Use it for small scenes only: large
+        ones have expressions of many pages.
         """
         return export.expressions(self)
 
     def latex(self) -> str:
-        """Return one equation per rate for an `align` environment, with numbers rounded
-        to six digits; requires SymPy.
+        """Return one equation per rate for an `align` environment, with numbers of six digits; requires
+        SymPy.
         """
         return export.latex(self)
 
     def _repr_latex_(self) -> str | None:
-        """Return the equations for display in a notebook, or None (then the summary is shown) if they
-        are long or SymPy is missing.
+        """Return the equations for display in a notebook. Return None, which shows the summary, for more than
+        100 operations or without SymPy.
         """
-        # notebooks show equations of at most 100 operations
         if self.operations > 100 or importlib.util.find_spec("sympy") is None:
             return None
         return "$$\\begin{aligned}\n" + self.latex() + "\n\\end{aligned}$$"
 
     def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
-        """Return the values that depend only on parameters, for the parameters of `scene`. They
-        are computed once per motion.
+        """Return the values that depend only on parameters, for the parameters of `scene`. They are computed
+        once per motion.
         """
         place = {
             int(n): (k, i)
@@ -156,15 +155,11 @@ class Lowered:
         known: dict = {}
         for n in self.graph.reachable(self.fixed):
             args = self.graph.args[n]
-            owners = (
-                {place[a][0] for a in args if a in place}
-                if self.graph.op[n] == "array" and all(a in place for a in args)
-                else ()
-            )
+            whole = self.graph.op[n] == "array" and all(a in place for a in args)
+            owners = {place[a][0] for a in args} if whole else ()
             if len(owners) == 1:  # entries of one parameter, read in one operation
-                known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(
-                    self.graph.value[n][0]
-                )
+                entries = leaves[owners.pop()][np.array([place[a][1] for a in args])]
+                known[n] = entries.reshape(self.graph.value[n][0])
         for n in self.graph.needed(self.fixed, known):
             if n in place:
                 leaf, i = place[n]
@@ -174,18 +169,18 @@ class Lowered:
     def rates(
         self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False
     ) -> tuple[tuple, tuple, PerLane | None]:
-        """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`;
-        NaN if a guard is not positive.
+        """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`; NaN if a guard is
+        not positive.
 
-        `fixed`: from `fixed_values`; `q`, `y`: coordinates and independent speeds, one scalar (or
-        batch) each; `inputs`: a vector.
+        `fixed`: from `fixed_values`; `q`, `y`: coordinates and independent speeds, one scalar (or batch)
+        each; `inputs`: a vector.
         """
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return `rates`, followed by: the pivots, which must keep their signs; the directions of
-        constraints; the smallest sine between a constraint with multiplier and the earlier ones (None without
-        such constraints). Only the rates have derivatives.
+        """Return the results of `rates`, the pivots, which must keep their signs, the directions of
+        constraints, and the smallest sine between a constraint with multiplier and the earlier ones (None
+        without multipliers). Only the rates have derivatives.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
@@ -213,9 +208,8 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        return self.all_speeds(fixed, t, q, y, inputs), smallest_pivot(
-            self.values(self.pivots, fixed, t, q, y, inputs)
-        )
+        speeds = self.all_speeds(fixed, t, q, y, inputs)
+        return speeds, smallest_pivot(self.values(self.pivots, fixed, t, q, y, inputs))
 
     def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
         """Return all speeds, integrated and dependent. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
@@ -224,8 +218,8 @@ class Lowered:
         return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
     def energies_at(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
-        """Return the kinetic and potential energy, J, without derivatives. `fixed`, `q`,
-        `y`, `inputs`: as in `rates`.
+        """Return the kinetic and potential energy, J, without derivatives. `fixed`, `q`, `y`, `inputs`: as in
+        `rates`.
         """
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
@@ -247,13 +241,11 @@ class Lowered:
         q = jax.lax.scan(lambda q, _: (step(self.projected_q, q, y), None), tuple(q), length=2)[0]
         if not self.projected_u:
             return q, y
-        return (
-            q,
-            jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=1 if affine else 2)[0],
-        )
+        steps = 1 if affine else 2
+        return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=steps)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers whose signs are monitored during every step: numbers of the rates and, with
+        """Return the numbers whose signs are monitored during every step: of the rates and, with
         `has_events`, of the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
@@ -263,11 +255,9 @@ class Lowered:
     ) -> Float[Array, "nodes *lanes"]:
         """Return values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
-        return (
-            jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out])
-            if nodes
-            else jnp.zeros((0, *like.shape), like.dtype)
-        )
+        if not nodes:
+            return jnp.zeros((0, *like.shape), like.dtype)
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out])
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, PerLane]:
         def lanes_last(n, x):
@@ -279,12 +269,11 @@ class Lowered:
 
     @property
     def calls(self) -> Labels:
-        """Return the reason for each JAX call in the rates and stop events: a part of a load
-        or event without scalar form.
+        """Return the reason for each JAX call in the rates and stop events: a part of a load or event without
+        scalar form.
         """
-        return tuple(
-            self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events])
-        )
+        calls = self.graph.calls([*self.qdot, *self.ydot, *self.events])
+        return tuple(self.graph.value[n].reason for n in calls)
 
 
 @functools.lru_cache(maxsize=64)

@@ -4,18 +4,17 @@
     q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
     u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact if the constraints are affine in the speeds
 
-S is symmetric, positive definite if the constraints are independent, and as sparse as they are local:
-tridiagonal for a chain. The remainder of a diagonal entry of S after elimination, relative to the entry, is
-the squared sine of the angle between this constraint and the earlier ones. Accelerations lose as many
-digits as this square is small.
+S is symmetric, positive definite if the constraints are independent, and sparse: tridiagonal for a chain. The
+remainder of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle
+between this constraint and the earlier ones. A square of 1e-k costs accelerations k digits.
 
-A constraint whose row vanishes at some configuration has a small entry instead of a small angle, so entries
-are bounded from below by their size at a probe with the same parameters (`Probes.in_the_middle`). Constraints
-nonlinear in the speeds may legitimately become small. They are lost where the remainder of their row, L^-1 A,
-passes through zero and reverses.
+A constraint whose row vanishes at some configuration has a small entry instead of a small angle. Entries are
+therefore bounded from below by their size at a probe with the same parameters (`Probes.in_the_middle`). The
+entry of a constraint nonlinear in the speeds may be small. Such a constraint is lost where the remainder of
+its row, a row of L^-1 A, passes through zero and reverses.
 
-If M is singular but every admissible velocity has inertia, M + A' W A replaces M. This changes only the
-multipliers, because A udot is prescribed.
+If M is singular but every admissible velocity has inertia, M + A' W A replaces M, with positive weights W.
+This changes only the multipliers, because A udot is prescribed.
 """
 
 from typing import NamedTuple
@@ -36,11 +35,10 @@ class Accelerations(NamedTuple):
     """Accelerations and monitored quantities."""
 
     udot: NodeList
-    sines: NodeList  # one per constraint, its sine with the earlier ones; or the pivots of independent speeds
+    sines: NodeList  # of the angles between constraints and earlier ones; or pivots of independent speeds
     margins: NodeList  # must stay positive: remainder of each entry minus its lower limit
     directions: Columns = []  # of constraints, must not reverse within a step
-    # per constraint: remainder of its entry, and its size; the ratio is a squared sine
-    squares: NodeList = []
+    squares: NodeList = []  # per constraint: remainder of its entry, and its size
 
 
 def accelerations_by_multipliers(
@@ -70,30 +68,23 @@ def accelerations_by_multipliers(
     multipliers = solved.solution[0]
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
-    sines = [
-        graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left
-    ]
-    # relative sine or length below which round-off decides how a motion continues,
-    # and the program is not valid
+    ratios = (graph.div(pivot, S[r][r]) for r, pivot in left)
+    sines = [graph.call("sqrt", graph.call("max", graph.zero, ratio)) for ratio in ratios]
+    # least relative sine or length; below it round-off decides how a motion continues
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
     if affine:
-        return Accelerations(
-            udot,
-            sines,
-            margins,
-            squares=[n for (_, pivot), size in zip(left, sizes, strict=True) for n in (pivot, size)],
-        )
+        squares = [n for (_, pivot), size in zip(left, sizes, strict=True) for n in (pivot, size)]
+        return Accelerations(udot, sines, margins, squares=squares)
     signs = [[margin, *[graph.zero] * (len(f) - 1)] for margin in margins]
-    return Accelerations(
-        udot, sines, [], [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)]
-    )
+    rows = [[column[r] for column in solved.forward[1:]] for r, _ in left]
+    return Accelerations(udot, sines, [], [*signs, *rows])
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
-    """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The
-    added inertia has the size of M.
+    """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The added
+    inertia has the size of M.
     """
     made, speeds = [list(row) for row in M], range(len(M))
     heavy = np.nanmedian(largest(probes([row[i] for i, row in enumerate(M)]), 0))

@@ -1,4 +1,10 @@
-"""Velocities, partial velocities and accelerations of the bodies at ydot = 0, as scalar expressions."""
+"""Velocities v, omega, partial velocities beta, gamma and accelerations a_0, alpha_0 at ydot = 0 of the
+bodies, as scalar expressions.
+
+*Explicit*: substitute the dependent speeds z(q, y) into the velocities, then differentiate. Best if z is
+simple. *Implicit*: differentiate the velocities as functions of all speeds, with zdot from the constraints'
+derivative.
+"""
 
 from dataclasses import replace
 
@@ -32,12 +38,8 @@ class Kinematics:
     # Explicit: substitute the dependent speeds into the velocities, then differentiate.
 
     def _explicitly(self) -> None:
-        A = [
-            list(row)
-            for row in zip(
-                *(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True
-            )
-        ]
+        by_speed = [self._at(column) for column in columns(self.graph, self.phi, self.u)]
+        A = [list(row) for row in zip(*by_speed, strict=True)]
         self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
         unheld = self.known if not self.held else Kinematics(self.build, self.forms, {}, True).known
         raw, simple = self._velocities(unheld)
@@ -45,7 +47,7 @@ class Kinematics:
         partial = [self._simple(column) for column in columns(self.graph, simple, self.y)]
         self._shape(simple, partial, self._along(simple, raw, self.qdot))
 
-    # Implicit: differentiate the velocities as they are, and the constraints through body velocities.
+    # Implicit: differentiate the velocities in all speeds, and the constraints through body velocities.
 
     def _implicitly(self) -> None:
         g, build, at = self.graph, self.build, self.build.traced.at
@@ -80,9 +82,8 @@ class Kinematics:
             [row.get(k, g.zero) for k in range(len(self.u))]
             for row in directional_derivative(g, self.phi, directions)
         ]
-        A = np.reshape(
-            self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))
-        ).tolist()
+        entries = self._at(g.substituted([n for row in A for n in row], put))
+        A = np.reshape(entries, (len(A), len(self.u))).tolist()
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
         self._solve(A, phi_0)
         parts = self._parts(at_fixed_speeds)
@@ -106,20 +107,11 @@ class Kinematics:
         put_z = {} if self.free_z else self.known
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
-        zdot = self._simple(
-            [
-                row[0]
-                for row in eliminate(
-                    g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far
-                ).solution
-            ]
-        )
+        found = eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far)
+        zdot = self._simple([row[0] for row in found.solution])
+        by_dependent = [by_speed[k] for k in build.dependent]
         moved = [
-            [
-                (j, column[n])
-                for j, column in enumerate(by_speed[k] for k in build.dependent)
-                if column[n] != g.zero
-            ]
+            [(j, column[n]) for j, column in enumerate(by_dependent) if column[n] != g.zero]
             for n in range(len(simple))
         ]
         through_z = lambda z, n: g.total(g.mul(z[j], by_z) for j, by_z in moved[n])
@@ -173,15 +165,12 @@ class Kinematics:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
     def _cut(self, levels) -> dict[int, int]:
-        """Return traced nodes -> replacements (zero if none is given); constants are excluded."""
+        """Return a dictionary: traced nodes that vary -> replacements (zero if none is given)."""
         pairs: dict[int, int] = {}
         for nodes, values in levels:
             flat = np.ravel(nodes).tolist()
-            new = (
-                [self.graph.zero] * len(flat)
-                if values is None
-                else np.ravel(np.array(values, np.int64)).tolist()
-            )
+            new = [self.graph.zero] * len(flat)
+            new = new if values is None else np.ravel(np.array(values, np.int64)).tolist()
             for n, v in zip(flat, new, strict=True):
                 if self.graph.op[n] == "neg":
                     n, v = self.graph.args[n][0], self.graph.neg(v)
@@ -197,16 +186,10 @@ class Kinematics:
             g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held}
         )
         for k, by_held in enumerate(jacobian(g, raw, list(self.held)) if self.held else ()):
-            slopes = self._at([by_held[n] for n in self.held if n in by_held])
-            rates[k] = g.total(
-                [
-                    rates[k],
-                    *(
-                        g.mul(moving[n], d)
-                        for n, d in zip((n for n in self.held if n in by_held), slopes, strict=True)
-                    ),
-                ]
-            )
+            used = [n for n in self.held if n in by_held]
+            slopes = self._at([by_held[n] for n in used])
+            terms = (g.mul(moving[n], d) for n, d in zip(used, slopes, strict=True))
+            rates[k] = g.total([rates[k], *terms])
         return self._simple(rates)
 
     def _velocities(self, replacement) -> tuple[NodeList, NodeList]:

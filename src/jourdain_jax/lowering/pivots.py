@@ -1,11 +1,10 @@
 """Pivots for eliminating a linear system of nodes, chosen to be large wherever the system itself is regular.
 
-A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken
-first. Others are judged by their smallest value over all probes, relative to their row. Among good
-pivots, the one with the least fill-in is taken. If only entries that may vanish remain, two rows and
-two columns are eliminated together if their determinant cannot vanish. Vector components in rotated
-axes, such as the velocity of a hitch, have a determinant that depends only on parameters, while each
-entry is zero at some angle.
+A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first.
+Other pivots are judged by their smallest value over all probes, relative to their row. Among good pivots, the
+one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
+eliminated together if their determinant cannot vanish. For example, components of the velocity of a hitch in
+rotated axes have a determinant that depends only on parameters, while each entry is zero at some angle.
 
 If no order of elimination works, rows are combined. The rows a_1, a_2, ... of one column give one row with
 the pivot sum w_i a_i^2, and the others are made orthogonal to it. The constraints of a rolling wheel along
@@ -51,7 +50,7 @@ class _Entry:
 
 class Pivots:
     """System `A x = right` during elimination, and the choice of the next pivot. `probes`: states in the
-    domain; `far`: with angles over full turns.
+    domain; `far`: function that returns states with angles over full turns.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class Pivots:
         self._sizes: dict[int, np.ndarray] = {}  # size of the terms of each row
         self._entries: dict[int, list[int]] = {}  # columns with structurally nonzero entries, by row
         self._judged: dict[int, dict[int, _Entry]] = {}
-        # of two rows and columns, None if unsuitable as a pivot
+        # two rows, two columns -> determinant; None if it is no pivot
         self._determinants: dict[tuple[int, int, int, int], int | None] = {}
 
     def eliminated(self, pivot: Pivot) -> None:
@@ -144,11 +143,9 @@ class Pivots:
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
-            ratio = (
-                _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
-                if columns
-                else np.empty((0, 1))
-            )
+            ratio = np.empty((0, 1))
+            if columns:
+                ratio = _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
             worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)  # at any probe
             self._judged[row] = {
                 c: _Entry(w, bool(w > 0) and self._is_fixed(n))
@@ -165,18 +162,14 @@ class Pivots:
 
     def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
         entry = self.A[row][column]
-        return Pivot(
-            (row,),
-            (column,),
-            ((self.graph.div(self.graph.one, entry),),),
-            entry if monitored is None else monitored,
-        )
+        inverse = ((self.graph.div(self.graph.one, entry),),)
+        return Pivot((row,), (column,), inverse, entry if monitored is None else monitored)
 
     # judgement at probes in the domain, and with angles over full turns where the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Return whether an entry stays away from zero wherever the system is
-        regular, also outside the domain.
+        """Return whether an entry is far from zero wherever the system is regular, also outside the
+        domain.
         """
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
@@ -194,14 +187,13 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """Return the probes, in the domain and far from it, at which the system with scaled
-        rows and columns is regular.
+        """Return the probes, in the domain and far from it, at which the system with scaled rows and columns
+        is regular.
         """
         if self._kept_regular is None:
             count = len(self._given[0])
-            A = np.moveaxis(
-                self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0
-            )
+            values = self._at([n for row in self._given for n in row])
+            A = np.moveaxis(values.reshape(len(self._given), count, -1), -1, 0)
             finite = all_finite(A, axis=(1, 2))
             A = np.where(finite[:, None, None], A, 0.0)
             lengths = np.linalg.norm(A, axis=2, keepdims=True)
@@ -225,8 +217,8 @@ class Pivots:
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
-        """Return reference sizes of the rows of some entries at the first probes, or None if a vanishing
-        row makes the system singular.
+        """Return reference sizes of the rows of some entries at the first `count` probes. Return None if the
+        system has no more rows than unknowns, since a vanishing row then makes it singular.
         """
         if not self._tall:
             return None
@@ -235,8 +227,8 @@ class Pivots:
     # two rows and two columns
 
     def _best_pair(self) -> Pivot | None:
-        """Return two rows and columns whose determinant depends only on parameters, with the least
-        fill-in; None if there are none.
+        """Return the two rows and columns with the least fill-in whose determinant depends only on
+        parameters, or None.
         """
         graph, A = self.graph, self.A
         used = {r: set(self._in_row(r)) for r in self.rows}
@@ -258,9 +250,8 @@ class Pivots:
             return None
         _, r, s, c, d, determinant = min(found)
         over = [graph.div(n, determinant) for n in (A[s][d], A[r][d], A[s][c], A[r][c])]
-        return Pivot(
-            (r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant
-        )
+        inverse = (over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])
+        return Pivot((r, s), (c, d), inverse, determinant)
 
     def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
         """Return a b - c d if it depends only on parameters and is not small; otherwise None."""
@@ -275,8 +266,8 @@ class Pivots:
     # combined rows
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """Combine all rows that contain a column into one pivot row for it, or take the entry at
-        `single` if that is as good.
+        """Combine all rows with an entry in a column into one pivot row, or take the entry at `single` if it
+        is as good.
         """
         graph, A, regular = self.graph, self.A, self._regular
         found = []
@@ -298,10 +289,8 @@ class Pivots:
         if not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular]):
             return self._single(*single)
         *_, c, users, weights, squares = min(found)
-        combined = (
-            self._turned if len(users) == 2 and len(self.rows) <= len(self.columns) else self._orthogonal
-        )
-        return combined(c, users, weights, squares)
+        two = len(users) == 2 and len(self.rows) <= len(self.columns)
+        return (self._turned if two else self._orthogonal)(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
         """Return weights for combining rows: one if their sizes are similar."""
@@ -313,17 +302,16 @@ class Pivots:
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 
     def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Rotate two rows into one with the pivot and one without: `a r + w b s` and `b r - a s`. The sign of
-        the determinant is unchanged.
+        """Replace the rows r, s with entries a, b in column c by `w_r a r + w_s b s`, the pivot row, and
+        `b r - a s`, with weights w.
         """
         graph, A, (r, s) = self.graph, self.A, users
         a, b = A[r][c], A[s][c]
         first, second = (graph.mul(graph.const(w), n) for w, n in zip(weights, (a, b), strict=True))
         sizes = [np.abs(self._at([a])[0]), np.abs(self._at([b])[0])]
-        self._sizes[r], self._sizes[s] = (
-            weights[0] * sizes[0] * self._size(r) + weights[1] * sizes[1] * self._size(s),
-            sizes[1] * self._size(r) + sizes[0] * self._size(s),
-        )
+        of_r, of_s = self._size(r), self._size(s)
+        self._sizes[r] = weights[0] * sizes[0] * of_r + weights[1] * sizes[1] * of_s
+        self._sizes[s] = sizes[1] * of_r + sizes[0] * of_s
         for row in (A, self.right):
             pairs = list(zip(row[r], row[s], strict=True))
             row[r] = [
@@ -335,8 +323,8 @@ class Pivots:
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Combine all rows of a column into one new row, and make the other rows orthogonal
-        to the column (Gram-Schmidt).
+        """Add a row that combines all rows with an entry in a column, and remove the entry from these
+        (Gram-Schmidt).
         """
         graph, A = self.graph, self.A
         new = len(A)
@@ -368,8 +356,8 @@ class Pivots:
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
-    """Return the ratios of entries to the largest entry of their row, or to `sizes` if larger.
-    Entries of a row are contiguous.
+    """Return the ratios of entries to the largest entry of their row, or to `sizes` if larger. Entries of a
+    row are contiguous.
     """
     values = np.abs(values)
     # places are ordered by rows
@@ -382,11 +370,8 @@ def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.nda
 
 def turns(graph: Graph, node: int) -> bool:
     """Return whether a node is the sine or cosine of a parameter, which may be any angle."""
-    return (
-        graph.op[node] in ("sin", "cos")
-        and graph.op[graph.args[node][0]] == "input"
-        and not graph.varies[node]
-    )
+    of_input = graph.op[node] in ("sin", "cos") and graph.op[graph.args[node][0]] == "input"
+    return of_input and not graph.varies[node]
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:

@@ -1,18 +1,17 @@
-"""Relations that decide between branches of rates and stop events, as numbers whose signs decide.
-They become sides (`sides.py`).
+"""Relations that decide between branches of rates and stop events. The sign of a number decides (`sides.py`):
 
-    a < b, max(a, b), ...    a - b          sign(x), |x|    x
-    floor(x), ceil(x)    sin(pi x)          round(x)    sin(pi (x + 1/2))
+    relation    a < b, max(a, b), ...     sign(x), |x|     floor(x), ceil(x)     round(x)
+    number      a - b                     x                sin(pi x)             sin(pi (x + 1/2))
 
-A relation counts if a rate or its slope differs on either side of the zero of its number, or if a stop event
-may have a dip there. Relations on which its number depends then count as well. Relations with equal
-branches, as in guards, do not count.
+A relation counts if a rate or its slope differs between the two sides of the zero of its number, or if a stop
+event may have a dip there. Relations on which this number depends then count as well. Relations with equal
+branches, as in guards, do not count. A relation without a zero between probes counts.
 
-Both branches are evaluated on either side of zeros between probes, for all decisions of unrelated relations:
-the branches of `(x > a) & (y > b)` agree where y < b. A relation without a zero between probes counts.
+Both branches are evaluated on both sides of zeros between probes, for all decisions of unrelated relations:
+the branches of `(x > a) & (y > b)` agree where y < b.
 
-A rate jumps at a zero if its change does not shrink with the distance between the two
-sides; otherwise it has a kink.
+A rate jumps at a zero if its change does not shrink with the distance between the two sides. Otherwise it has
+a kink.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,18 +25,18 @@ from jourdain_jax.program.graph import Graph, NodeList
 MOST_WATCHED = 32  # limit per scene
 # truth for a > b, and for a < b
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}
-EQUAL = {"eq": (False, False), "ne": (True, True)}  # these alone decide nothing
+EQUAL = {"eq": (False, False), "ne": (True, True)}  # numbers of these relations alone do not count
 COMPARED |= EQUAL
 # distance from a zero, relative to the distance of two probes; tolerance relative to the size of a rate
 ASIDE, AGREE = 1e-5, 1e-7
-DECISIONS = 512  # maximum number of decisions of other relations tried at each zero; random beyond
+DECISIONS = 512  # maximum number of decisions of other relations at each zero; of more, random ones are tried
 Decided = dict[int, list[tuple[int, int]]]  # as `switches` returns it
 WHOLE = ("floor", "ceil", "round", "rem")
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> Decided:
-    """Return number whose sign decides -> its relations. Each relation has a factor: 1, or -1 if it
-    decides on the negative number.
+    """Return a dictionary: number whose sign decides -> its relations, each with a factor: 1, or -1 if the
+    negative number decides.
     """
     found: Decided = {}
     for n in graph.reachable(list(nodes)):
@@ -68,9 +67,7 @@ def _own(graph: Graph, node: int) -> int | None:
 
 
 def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
-    """Return the number whose integer part decides: a/b for rem(a, b), a + 1/2 for
-    round(a), a for floor(a) and ceil(a).
-    """
+    """Return the number whose integer part decides: a/b for rem(a, b), a + 1/2 for round(a), otherwise a."""
     if op == "rem":
         return graph.div(*args)
     return graph.add(args[0], graph.const(0.5)) if op == "round" else args[0]
@@ -79,14 +76,11 @@ def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
 def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
     if node not in known:
         op, args = graph.operation(node)
-        squared = (
-            op in ("sqrt", "abs", "exp", "cosh")
-            or (op == "mul" and args[0] == args[1])
-            or (op == "const" and graph.value[node] >= 0)
-        )
-        known[node] = squared or (
-            op in ("add", "mul", "div") and all(_is_never_negative(graph, a, known) for a in args)
-        )
+        squared = op == "mul" and args[0] == args[1]
+        constant = op == "const" and graph.value[node] >= 0
+        known[node] = op in ("sqrt", "abs", "exp", "cosh") or squared or constant
+        if op in ("add", "mul", "div") and not known[node]:
+            known[node] = all(_is_never_negative(graph, a, known) for a in args)
     return known[node]
 
 
@@ -120,8 +114,7 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
 def relations(
     graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]
 ) -> tuple[Indices, Indices]:
-    """Return the numbers whose signs are monitored, in two parts: those in the rates,
-    and those only in stop events.
+    """Return the numbers whose signs are monitored: numbers of the rates, and further numbers of stop events.
 
     Numbers that depend on `modes` are omitted, because modes have their own events.
     """
@@ -158,13 +151,13 @@ def _difference(values, above, below):
 
 
 def _dip(values, above, below):
-    """Return by how much a value exceeds the lower of its two branches; if it does, it may dip."""
+    """Return the excess of a value over the lower of its two branches; with an excess it may dip."""
     return values - np.minimum(above, below)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
-    """Return the numbers whose branches continue beyond their zeros, because both are
-    finite where the outputs are.
+    """Return the numbers whose branches continue beyond their zeros: both are finite wherever the outputs
+    are.
     """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
@@ -192,9 +185,10 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], probes: Probes) -> Iterator:
-    """Yield a function (distance -> states on either side of zeros of a number) with the outputs. Then
-    yield the same for all decisions of unrelated relations: neither number depends on the other, and theirs
-    vary between the zeros. Yields nothing without a zero between probes.
+    """Yield a function from a distance to states before and behind zeros of a number, and the outputs. Then
+    yield the same for all decisions of unrelated relations. Yields nothing without a zero between probes.
+
+    A relation is unrelated if neither number depends on the other, and its number varies between the zeros.
     """
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)

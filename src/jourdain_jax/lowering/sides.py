@@ -1,5 +1,5 @@
-"""Relations of a scalar program as modes and events: a mode s stores on which
-side of a relation the state is.
+"""Relations of a scalar program as modes and events. A mode s is the side of a relation on which the state
+is.
 
     x = a - b of a < b, max(a, b), ...; x of |x|, sign(x)     s = 1, -1: x counts as positive, negative
     c = s x falls through zero:  s <- -s                      s = 0: x rests at zero; its current sign counts
@@ -8,8 +8,8 @@ side of a relation the state is.
     c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
 
 No branch changes within a step: the event search ends the step where x vanishes, and the derivative jumps
-there as at any event (`integrate/loop/transitions.py`). Modelica treats relations the same way. If a branch
-is undefined beyond x = 0, as with `sqrt`, its relation has only the event.
+there as at any event (`integrate/loop/transitions.py`). Modelica treats relations in the same way. If a
+branch is undefined beyond x = 0, as with `sqrt`, its relation has only the event.
 """
 
 from dataclasses import replace
@@ -66,9 +66,7 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
-        """Add a reset: the state and the modes `after` an event, the sides at the new
-        state, and the gain in energy.
-        """
+        """Add a reset: the state and the modes `after` an event, the sides there, and the gain in energy."""
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # in order of dependence
             (moved,) = graph.substituted([x[k]], after)
             if moved != x[k] and sides[k] not in after:
@@ -91,26 +89,22 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
         else:
             add({side: where(graph, at_rest, graph.call("sign", number), graph.neg(side))}, graph.zero)
             falls.append(where(graph, graph.call("lt", side, graph.zero), graph.neg(number), number))
+    copied |= {"events": (*events, *falls), "resets": tuple(resets), "z": ()}
     return replace(
         program,
         traced=Variables(graph, new[program.traced.t], q, u, inputs, []),
         inputs=(*program.inputs, *(f"side {k}" for k in range(len(sides)))),
         fixed=tuple(new[n] for n in program.fixed),
         power=new[program.power],
-        **copied
-        | {
-            "events": (*events, *falls),
-            "resets": tuple(resets),
-            "stops": (*stops, *[False] * len(sides)),
-            "z": (),
-        },
+        stops=(*stops, *[False] * len(sides)),
         sides=tuple(wholes),
+        **copied,
     )
 
 
 def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, int]) -> int:
-    """Return the number a whose integer part decides; `first`: one of its relations,
-    with -1 if that decides on -a.
+    """Return the number a whose integer part decides. `first`: one of its relations, and -1 if -a decides
+    there.
     """
     node, turned = first
     found = counted(graph, old.op[node], [new[a] for a in old.args[node]])
@@ -128,7 +122,9 @@ def _odd(graph: Graph, n: int) -> int:
 
 
 def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, number: int, whole: bool) -> int:
-    """Return the value of a relation on this side of its number or, `turned` by -1, of the negative number."""
+    """Return the value of a relation on this `side` of its number; `turned`: -1 if the negative number
+    decides.
+    """
     at_rest = graph.call("eq", side, graph.zero)
     if op in WHOLE:
         n = _whole(graph, side)

@@ -1,16 +1,17 @@
 """Names that methods read from outside their arguments.
 
 As everywhere in JAX, a method is traced once, and values that are not fields of the scene become constants of
-the trace. They belong to the structure of the scene, and are compared at each call. Tracked are the members
-of the class, and the global names and variables of enclosing functions that a method loads itself:
+the trace. They belong to the structure of the scene and are compared at each call. The compared values are
+the members of the class, and the global names and variables of enclosing functions that a method reads
+itself:
 
 - numbers, texts and tuples of them are compared by type and value, functions by the identity of the function
   and of its code. So `g = 1.62` in a later cell of a notebook, or `%autoreload`, takes effect;
-- modules, classes and their attributes are constants, and so are functions wrapped by Python, JAX or another
-  package, by identity;
+- modules, classes, and functions wrapped by Python, JAX or another package are compared by identity; their
+  attributes are constants;
 - arrays, containers and objects with state raise an error, since their changes could not be noticed.
 
-Values read by helper functions are not tracked. After `clear_caches` every scene is traced again.
+Values that helper functions read are not compared. After `clear_caches` every scene is traced again.
 """
 
 import enum
@@ -51,7 +52,7 @@ _CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_cu
 
 
 class StatefulError(ValueError):
-    """Error for a name of an object whose changes cannot be noticed."""
+    """Raised for a name whose object may change unnoticed."""
 
 
 class NamesRead:
@@ -108,16 +109,17 @@ jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lam
 
 @lru_cache(maxsize=1024)
 def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
-    """Return the names that functions, and the methods of classes, read. Raises ValueError for a name in a
-    method that refers to an array, a container or an object with state. In a function such an object is a
-    constant, unless `strict`.
+    """Return the names that functions and the methods of classes read.
+
+    Raises ValueError if a name in a method refers to an array, a container or an object with state. In a
+    function such an object is a constant; with `strict` it raises ValueError, too.
     """
     return NamesRead(roots, strict)
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """Return the present values of the names that a function reads. None if its trace cannot be stored: one
-    of the values has state, or the argument is no function.
+    """Return the present values of the names that a function reads. Return None if its trace must not be
+    stored: one of the values has state, or the argument is no function.
     """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
@@ -126,7 +128,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 
 def is_function(x) -> bool:
-    """Return whether it is a function that may read values, rather than a module with numbers."""
+    """Return whether x is a function, which may read names, and not a module with numbers."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(attribute(x, "__wrapped__"))
 
 
@@ -144,17 +146,16 @@ class _Same:
 
 
 def _key(x: Any, whose: str = "", name: str = "") -> Hashable:
-    """Return the key of a value, or of one with state its identity. For the value of a `name` that a method
-    loads (`whose`), raises StatefulError instead.
+    """Return the key of a value; for a value with state, its identity. If a method `whose` reads it by a
+    `name`, a value with state raises StatefulError.
     """
     try:
         return _content(x)
     except StatefulError:
         if not whose:
             return _Same(x)
-    what = (
-        f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change unnoticed"
-    )
+    kind = "array" if isinstance(x, jax.Array) else type(x).__name__
+    what = f"an object ({kind}) that may change unnoticed"
     if is_traced(x):
         what = "which JAX is tracing (jit, grad, vmap) and which is not a field of the scene"
     raise StatefulError(
@@ -164,8 +165,8 @@ def _key(x: Any, whose: str = "", name: str = "") -> Hashable:
 
 
 def _content(x: Any) -> Hashable:
-    """Return type and value of an object without state; of a module, class or function its identity. Raises
-    StatefulError for values that may change: arrays, containers, objects.
+    """Return type and value of an object without state, or the identity of a module, class or function.
+    Raises StatefulError for values that may change: arrays, containers, objects.
     """
     own = getattr(x, "__dict__", None) or {}
     if type(x) in _EXACTLY or isinstance(x, np.number | np.bool_ | PurePath):
@@ -187,7 +188,7 @@ def _content(x: Any) -> Hashable:
 
 
 def _is_constant(x: Any) -> bool:
-    """Return whether it is a module, a class, a function, or another object without state."""
+    """Return whether x is a module, a class, a function, or another object without state."""
     if isinstance(x, BuiltinFunctionType | MethodType):
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":

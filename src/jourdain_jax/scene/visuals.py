@@ -129,7 +129,7 @@ class Visual(eqx.Module):
         """
         if len(points) < 2:
             raise ValueError(
-                f"`jj.Visual.line` got {len(points)} points, expected at least two; write "
+                f"`jj.Visual.line` has {len(points)} points, expected at least two; write "
                 "jj.Visual.line(a, b)"
             )
         what, advice = "point of a line to be drawn", "give three components, m"

@@ -3,10 +3,10 @@ on NumPy, all at once.
 
     q <- q - G+ g(q),   G = dg/dq          Gauss-Newton, which stays near its start
 
-Configurations that do not converge, or converge outside the domain, take short steps within the domain
-instead, from their start and then from random places. If constraints depend on each other at all assembled
-configurations (overconstrained linkages), their rank shows only at configurations accurate to round-off. The
-last steps therefore omit directions with small singular values.
+Configurations that do not converge, or converge outside the domain, are tried again by short steps within the
+domain, from their start and then from random places. Overconstrained linkages have constraints that depend on
+each other at all assembled configurations. Their rank shows only at configurations accurate to round-off, so
+the last steps omit directions with small singular values.
 """
 
 from dataclasses import dataclass, fields
@@ -26,13 +26,12 @@ class Assembled:
 
     q: np.ndarray  # (states, coordinates)
     position_error: np.ndarray  # largest residual of the rows, (states,); infinite for NaN
-    # of the coordinates: the last correction, relative to their size; infinite off the constraints, (states,)
-    error: np.ndarray
-    outside: np.ndarray  # distance from the domain in its widths; zero inside, (states,)
+    error: np.ndarray  # last correction of q, relative to 1 + |q|, (states,); infinite off the constraints
+    outside: np.ndarray  # distance from the domain in its widths, (states,); zero inside
 
     @property
     def on_rows(self) -> np.ndarray:
-        """Return whether they satisfy the constraints to round-off, (states,)."""
+        """Return which configurations satisfy the constraints to round-off, (states,)."""
         return np.isfinite(self.error)
 
 
@@ -45,11 +44,11 @@ def assemble(
     generic: np.ndarray,
     tries: int = 4,
 ) -> Assembled:
-    """Return configurations near q on the constraints. `look(q[k], k)` returns residuals and slopes of the
-    constraints at the states with indices k; slopes are the nonzero entries of a sparse matrix.
+    """Return configurations near q on the constraints, between `low` and `high` if possible.
 
-    Configurations of `generic` states that end outside the domain are tried again from random places, up to
-    `tries` times.
+    `look(q[k], k)`: residuals of the constraints, and the entries of their Jacobian with this `pattern`, at
+    the states with indices k. `generic`: which states are random. These are tried again from random places,
+    up to `tries` times, if they end outside the domain.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
     # off the constraints: at assembled configurations a row may have zero length
@@ -68,8 +67,7 @@ def assemble(
         with np.errstate(invalid="ignore"):
             position_error = largest(residual, 1)
             size = np.maximum(pattern.lengths(G), typical) * (1 + largest(q, 1, keepdims=True))
-            # converged: residuals below 1e4 units of round-off of the change of a row when a coordinate
-            # changes by its own size
+            # converged: residuals below 1e4 eps times the change of a row if a coordinate changes by its size
             arrived = np.all(np.abs(residual) <= 1e4 * np.finfo(float).eps * size, axis=1) & (shift <= 1e-7)
             outside = np.max(np.maximum(np.maximum(low - q, q - high), 0.0) / width, axis=1, initial=0.0)
         nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)
@@ -80,10 +78,8 @@ def assemble(
         lost = ~(found.on_rows & (found.outside <= 1e-6)) & (generic | (attempt == 0))
         if not lost.any():
             break
-        begin, which = (
-            generator.uniform(low, high, q.shape) if attempt else np.clip(q, low, high),
-            np.flatnonzero(lost),
-        )
+        begin = generator.uniform(low, high, q.shape) if attempt else np.clip(q, low, high)
+        which = np.flatnonzero(lost)
         # steps of at most a quarter of the domain's width, within the domain
         near, _ = newton(begin, which, longest=width / 4, within=(low, high))
         again = judged(*newton(near, which))
@@ -94,8 +90,8 @@ def assemble(
 
 
 def typical_lengths(lengths: np.ndarray) -> np.ndarray:
-    """Return the typical length of each constraint row: the median over states, or the largest if the row
-    vanishes at half of them; 1 if it always vanishes.
+    """Return the typical length of each constraint row: as `usual_lengths_of`, but 1 for a row that always
+    vanishes.
     """
     typical = usual_lengths_of(lengths)
     return np.where(typical > 0, typical, 1.0)
@@ -110,19 +106,18 @@ def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarr
 def typical_row_lengths(
     A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]
 ) -> Float[np.ndarray, "rows"]:
-    """Return the typical length of each row: the median over states, or the largest if the row vanishes at
-    half of them.
+    """Return the typical length of each row, as `usual_lengths_of`.
 
-    `elsewhere`: rows off the geometric constraints. A row that is only round-off relative to its length there
-    gets that length, so that it counts as zero.
+    `elsewhere`: the rows at states off the geometric constraints. A row that is only round-off beside its
+    length there gets that length, and so counts as zero.
     """
     length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
     return np.where(length > np.sqrt(eps_of(A)) * beyond, length, beyond)
 
 
 def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
-    """Return the median over the states with finite entries, or the largest for a row that vanishes at half
-    of them; 0 for a row that always vanishes.
+    """Return the median length of each row over the states with finite entries. For a row that vanishes at
+    half of the states return the largest length, which is 0 if it always vanishes.
     """
     length = length[all_finite(length, axis=1)]
     if not len(length):
@@ -131,7 +126,7 @@ def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarr
     return np.where(median > 0, median, length.max(axis=0))
 
 
-# Default domain: wide enough for angles to reach every direction, so that no partition passes by luck.
+# Default domain: angles reach every direction, so that a partition that is singular somewhere is found.
 COORDINATE_DOMAIN = (-3.2, 3.2)
 SPEED_DOMAIN = (-1.0, 1.0)
 

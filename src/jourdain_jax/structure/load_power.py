@@ -41,8 +41,8 @@ def explicit_power(
 
 
 def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
-    """Return the rate of the scene's own potential due to poses that move while `u = 0`. Its forces act on
-    the speeds, and so do no work in this motion.
+    """Return the rate of the scene's own potential due to poses that move at `u = 0`. The potential's forces
+    act on the speeds and do no work in this motion.
     """
     if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(motion.t)
@@ -50,11 +50,9 @@ def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
     nu = coordinate_rates(scene, t, q, jnp.zeros_like(motion.u.array))
     along = (t, q), (jnp.ones_like(t), nu)
     held = motion.pose().bodies
+    fixed = lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held))
     whole = jax.jvp(lambda t, q: potential_of(scene, pose_at(scene, t, q)), *along)[1]
-    return (
-        whole
-        - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
-    )
+    return whole - jax.jvp(fixed, *along)[1]
 
 
 def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: Indices) -> Scalar:
@@ -97,8 +95,8 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
 
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """Return `f` reduced to the operations that its result needs, so that unused forces of the same loads may
-    lack a derivative.
+    """Return `f` with only the operations that its result needs: unused forces of the same loads may lack a
+    derivative.
     """
     pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

@@ -7,10 +7,10 @@
     dg/dt along the motion of other bodies = 0  or  v, w != 0      g: pose of a contact's ground
     I_3 <= I_1 + I_2
 
-The table `CHECKS` lists them as functions of numbers at some states. It is evaluated when a scene is probed,
-and a fault raises its text. Checks with a `label` also run in the compiled program of each motion, where a
-fault is a result code. They run at the start, which may hide a fault, and at random states of the domain,
-projected onto the geometric constraints.
+The table `CHECKS` has these checks as functions of numbers at some states. It is evaluated when a scene is
+probed, and a fault raises its text. Checks with a `label` also run in the compiled program of each motion,
+where a fault is a result code. They run at the start and, since a start may hide a fault, at random states of
+the domain on the geometric constraints.
 """
 
 from collections.abc import Callable
@@ -41,14 +41,14 @@ _ROWS_INSTEAD = (
 @dataclass(frozen=True)
 class Check:
     """One check: the kind of numbers, the test (axis of states first), the sentence for one state, and a
-    label if it ends a motion.
+    label if the fault ends a motion.
     """
 
     of: str
     wrong: Callable
     says: Callable[[np.ndarray], str]
     label: str = ""
-    group: str = "faults"  # "grounds" and "moments": computable, but unlikely to be intended; "gravity"
+    group: str = "faults"  # or "gravity"; "grounds" and "moments" for numbers that are possible but unlikely
 
 
 def _size(x):
@@ -69,17 +69,12 @@ def _negative(x):
     at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)
     minor = lambda i, j, k, m: at(i, k) * at(j, m) - at(i, m) * at(j, k)
     whole = sum(at(0, i) * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
-    return reduce(
-        or_,
-        (
-            x < 0
-            for x in (
-                *(at(i, i) for i in range(3)),
-                *(minor(i, j, i, j) for i, j in combinations(range(3), 2)),
-                whole,
-            )
-        ),
-    )
+    minors = [
+        *(at(i, i) for i in range(3)),
+        *(minor(i, j, i, j) for i, j in combinations(range(3), 2)),
+        whole,
+    ]
+    return reduce(or_, (x < 0 for x in minors))
 
 
 def _from_identity(R):
@@ -99,14 +94,14 @@ def _off(square):
 
 
 def _nowhere(x):
-    """Return whether no state has finite numbers, as one flag per state."""
+    """Return one flag per state: true for all if no state has finite numbers."""
     bad = ~all_finite(x.reshape(len(x), -1), axis=1)
     return bad & np.all(bad)
 
 
 def _exceeds_the_others(x):
-    """Return whether the largest moment of a body exceeds the sum of the others; flat bodies are exempt. For
-    thin wheels both are equal, to the digits of published values.
+    """Return whether the largest moment of a body exceeds the sum of the others by one per cent, since both
+    are equal for thin wheels up to the digits of published values. Rods are exempt.
     """
     least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
     return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))
@@ -244,8 +239,8 @@ CHECKS = (
         "ground",
         lambda x: (x[..., 0] > TOLERANCE) & ~(x[..., 1] > 0).any(0),
         lambda _: (
-            "moves with another body, but its `velocity` and `angular_velocity` are zero; if that is a body "
-            f"of the scene, omit the contact and {_ROWS_INSTEAD}"
+            "moves with another body, but its `velocity` and `angular_velocity` are zero; omit the contact "
+            f"and {_ROWS_INSTEAD}"
         ),
         "a ground that another body carries",
         "grounds",
@@ -273,10 +268,8 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return for each fault whether the scene has it, at this state or at one of the states from `elsewhere`
-    with the coordinates `others`.
-
-    It works under jit and vmap. NaN is no fault.
+    """Return for each fault whether it occurs at this state or at a state from `elsewhere`, with the
+    coordinates `others`. This works under jit and vmap. NaN is no fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
@@ -290,7 +283,9 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether any number shows a fault, by kind. Axes: states first, then bodies or grounds."""
+    """Return whether any number has a fault. `stacked`: kind -> numbers, with axes of states and of
+    owners.
+    """
     found = [
         check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked
     ]
@@ -298,8 +293,8 @@ def any_wrong(stacked: dict[str, Array]) -> Flag:
 
 
 def impossible_bodies(scene: Scene, q) -> Sentences:
-    """Return one sentence for each body that no distribution of mass can have. Bodies without thickness whose
-    other moments are zero are omitted.
+    """Return one sentence for each body whose moments of inertia no distribution of mass has. Rods, with one
+    moment of zero, are exempt.
 
         m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
@@ -309,17 +304,12 @@ def impossible_bodies(scene: Scene, q) -> Sentences:
 
 @eval_numpy
 def _weights(scene: Scene, q) -> Numbers:
-    return {
-        kind: of
-        for kind, of in stated_of(scene, pose_at(scene, 0.0, q)).items()
-        if kind in ("mass", "inertia")
-    }
+    numbers = stated_of(scene, pose_at(scene, 0.0, q))
+    return {kind: numbers[kind] for kind in ("mass", "inertia")}
 
 
 def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:
-    """Return one sentence for each fault of a group of the table, about the first of the given states with
-    the fault. Numbers that are not finite are reported as such only.
-    """
+    """Return one sentence for each fault of a group of the table, about the first state with the fault."""
     found = []
     for check in (check for check in CHECKS if check.group == group):
         for name, x in numbers.get(check.of, {}).items():

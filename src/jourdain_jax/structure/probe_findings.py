@@ -1,4 +1,4 @@
-"""Probes of a scene, and what they show: which quantities vanish or change, and which speeds have no inertia."""
+"""Probes of a scene and their findings: quantities that vanish or change, and speeds without inertia."""
 
 from dataclasses import replace
 
@@ -37,16 +37,15 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         found = probed_on_graph(scene, t, q, u, u_other, generic)
         if not found.in_calls:
             return found
-        # the graph does not show how calls behave away from the probes, so a few distant states are probed
+        # calls of JAX may change away from the probes, so a few distant states are probed
         generator, count = np.random.default_rng(1), 16
         far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
         for first, _ in scene.coordinates.quaternions:
             far[1][:, first : first + 4] = q[:count, first : first + 4]
         u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
         beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
-        return replace(
-            found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u))
-        )
+        unproved = (found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u))
+        return replace(found, unproved=unproved)
     except Unsupported as reason:
         raise ValueError(
             f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
@@ -73,24 +72,22 @@ def speed_terms(found: Probed, u: np.ndarray) -> np.ndarray:
 def at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
     """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
     symmetric = symmetric_configurations(scene)
-    t, q, u = (
-        np.concatenate([t, np.zeros(len(symmetric))]),
-        np.concatenate([q, symmetric]),
-        np.concatenate([u, u[:1].repeat(len(symmetric), 0)]),
-    )
+    t, q = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric])
+    u = np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES
     return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
 
 
 def is_singular(M: np.ndarray) -> bool:
     """Return whether scaled inertias are singular at all states."""
-    return bool(M.size) and bool(
-        np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * eps_of(M))
-    )
+    if not M.size:
+        return False
+    least = np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0]
+    return bool(np.all(least <= 16 * M.shape[1] * eps_of(M)))
 
 
 def check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
-    """Raise ValueError for speeds along which free motion has no inertia at every generic state."""
+    """Raise ValueError for speeds along which a free motion has no inertia at any generic state."""
     moved = []
     for A, M, c in zip(found.A, found.M, found.c, strict=True):
         free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
@@ -111,8 +108,8 @@ def check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
 
 
 def far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
-    """Return scaled rows at states on the geometric constraints whose coordinates differ from the given ones
-    by up to half a turn.
+    """Return scaled rows at states on the geometric constraints, with coordinates up to half a turn from
+    q.
     """
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))

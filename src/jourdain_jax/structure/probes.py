@@ -3,8 +3,7 @@
     A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
     q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-A scene is traced once per class, with the probed quantities as nodes of its graph and the parameters as
-inputs.
+The graph is traced once per class. The probed quantities are its nodes, the parameters its inputs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -41,10 +40,10 @@ SparseRows = list[dict[int, int]]  # by row: variable -> node of the derivative
 
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
-# Quantities that an integration cannot do without. If calls compute them, distant states are probed; for
-# loads, nothing is assumed.
+# Quantities of poses and constraints. If calls of JAX compute them, distant states are probed; quantities of
+# loads that calls compute count as nonzero.
 _MOTION = frozenset(
-    {
+    (
         "rows",
         "poses",
         "inertias",
@@ -53,7 +52,7 @@ _MOTION = frozenset(
         "motion at rest",
         "inertia",
         "nonlinear",
-    }
+    )
 )
 
 
@@ -61,9 +60,9 @@ class Probed(eqx.Module):
     """Probed quantities at one state, or at many with a leading axis; trees have arrays as leaves."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric constraints
-    position_error: Float[Entries, "*states"]  # of these constraints; this and the next two as in `Assembled`
-    error: Float[Entries, "*states"]  # of the coordinates
-    outside: Float[Entries, "*states"]  # of the domain
+    position_error: Float[Entries, "*states"]  # as in `Assembled`
+    error: Float[Entries, "*states"]  # as in `Assembled`
+    outside: Float[Entries, "*states"]  # as in `Assembled`
     G: Float[Entries, "*states closures coordinates"]
     A: Float[Entries, "*states rows speeds"]
     A_other: Float[Entries, "*states rows speeds"]  # at other speeds
@@ -91,10 +90,12 @@ class LookedAt:
     velocities: SparseRows  # d (v, omega)/du
     closures: list[int]  # geometric constraints and unit norms
     of_closures: SparseRows  # their derivatives with respect to q
-    # Quantities that may be zero everywhere: "rows at rest" and "motion at rest" (velocities and rates of
-    # coordinates), at u = 0; rates in time by `TIMED`, at fixed coordinates, speeds and inputs (for loads and
-    # potentials: at fixed motion); rates of the "inertia" along the motion; and along a generic change of the
-    # inputs, the rates "rows of inputs" and those of each load's potential, "potential 0", ...
+    # Quantities that may be zero everywhere:   "rows at rest", "motion at rest"      residuals, and
+    # velocities and rates of coordinates, at u = 0   names of `TIMED`                      rates in time at
+    # fixed coordinates, speeds and inputs; for loads                                         and potentials
+    # at fixed motion   "inertia"                             rates of masses and inertias along the motion
+    # "rows of inputs", "potential 0", ...  rates of constraints and of each load's potential along a generic
+    # change of the inputs
     vanishing: dict[str, list[int]]
     in_calls: frozenset[str]  # quantities that depend on calls of JAX
     nonanalytic: frozenset[str]  # quantities that depend on an operation that is not analytic
@@ -125,14 +126,10 @@ def looked_at(scene: Scene) -> LookedAt:
     potentials = derivatives(g, traced.particulars.potentials.tolist(), changed)
     vanishing = {name: derivatives(g, _flat(nodes), {traced.t: g.one}) for name, nodes in by_time.items()}
     vanishing |= {name: _flat(nodes) for name, nodes in traced.particulars.explicit.items()}
-    vanishing |= {
-        "rows at rest": at_rest[:rows],
-        "motion at rest": at_rest[rows:],
-        "inertia": derivatives(g, weights, along_motion),
-    }
-    vanishing |= {"rows of inputs": derivatives(g, at.phi.tolist(), changed)} | {
-        f"potential {k}": [rate] for k, rate in enumerate(potentials)
-    }
+    vanishing |= {"rows at rest": at_rest[:rows], "motion at rest": at_rest[rows:]}
+    vanishing |= {"inertia": derivatives(g, weights, along_motion)}
+    vanishing |= {"rows of inputs": derivatives(g, at.phi.tolist(), changed)}
+    vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potentials)}
     closures = traced.closures
     return LookedAt(
         traced=traced,
@@ -154,8 +151,8 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities in which operations of these kinds occur. "rank" means the constraint rows,
-    "nonlinear" their dependence on the speeds.
+    """Return the quantities in which operations of these kinds occur: names of `vanishing`, "rank" for the
+    Jacobian of the constraints, and "nonlinear" for its dependence on the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
@@ -163,47 +160,44 @@ def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: 
     bent = any(a and b for a, b in zip(depend_on(g, entries, u), passing, strict=True))
     found = {name for name, nodes in vanishing.items() if any(passes(g, nodes, kinds))}
     found |= {"rank"} if any(passing) or "rows at rest" in found else set()
-    return frozenset(
-        found | ({"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set())
-    )
+    bent = bent or decided_by(g, traced.at.phi.tolist(), u, kinds)
+    return frozenset(found | ({"nonlinear"} if bent else set()))
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
     """Probe the scene at states (t, q, u), projected onto the geometric constraints, and its constraints also
-    at `u_other`. `generic`: marks of random states.
+    at `u_other`. `generic`: which states are random.
 
     `limits`: as in `assemble`. Raises `Unsupported` for a call without a derivative in JAX.
     """
-    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(
-        u_other
-    )
+    at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits)
+    return at.probed(u_other)
 
 
 def projected(scene: Scene, t, q) -> Assembled:
-    """Return the configurations on the geometric constraints that are nearest to q; none is tried again."""
+    """Return the configurations on the geometric constraints nearest to q, without further tries."""
     still, every = np.zeros((len(t), len(scene.speed_names.entries))), np.ones(len(t), bool)
     return _AtStates(looked_at(scene), scene, t, q, still, np.zeros(len(scene.inputs)), every, tries=0).found
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    """Return projected coordinates and speeds, and the accuracy of the coordinates."""
+    """Return projected coordinates and speeds, and the errors of the coordinates."""
     at = _AtStates(looked_at(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.found
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
-    """Return whether these velocity constraints are combinations of the others at all states that satisfy the
-    geometric constraints, at generic parameters.
+    """Return whether these velocity constraints are combinations of the others at all states on the geometric
+    constraints, at generic parameters.
 
-    The rows satisfy `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` if the residual of least squares is at most the
-    round-off of either side.
+    Row s is a combination of the kept rows k if `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` has a solution x up to
+    round-off.
     """
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced
     generic = generic_states(traced, at.values)
-    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [
-        at.nodes.vanishing["rows at rest"]
-    ]
+    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()]
+    columns_of_rows.append(at.nodes.vanishing["rows at rest"])
     found = generic([n for column in columns_of_rows for n in column])
     shape = len(columns_of_rows), len(traced.at.phi), -1
     A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
@@ -212,7 +206,7 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 
 
 def generic_states(traced: TracedScene, near: Probes) -> IdentityProbes:
-    """Return generic states on the geometric constraints, at generic parameters, found from the states
+    """Return generic states on the geometric constraints, at generic parameters, by projection from
     `near`.
     """
     coordinates = {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
@@ -280,9 +274,8 @@ class _AtStates:
         """Return `M = sum m beta' beta + gamma' I gamma`."""
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
         partial = self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist())
-        return mass_matrix(
-            mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0)
-        )
+        beta, gamma = np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0)
+        return mass_matrix(mass, inertia, beta, gamma)
 
     def speeds_on_rows(self) -> np.ndarray:
         """Return speeds projected onto the constraints, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds;
@@ -293,9 +286,8 @@ class _AtStates:
             return u
         M = self._mass_matrix()
         c = speed_scales(M)
-        metric = c[:, :, None] * np.stack(
-            [_inverse_root(m) for m in c[:, :, None] * M * c[:, None]]
-        )  # C L'^-1
+        scaled = c[:, :, None] * M * c[:, None]
+        metric = c[:, :, None] * np.stack([_inverse_root(m) for m in scaled])  # C L'^-1
 
         def moved(x, which):
             return u[which] + np.einsum("sij,sj->si", metric[which], x)
@@ -319,14 +311,10 @@ class _AtStates:
             q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
         if not self.traced.at.closure.size:
             return Assembled(q, *np.zeros((3, len(q))))
-        rows, entries, place = (
-            self.nodes.closures,
-            self.nodes.of_closures,
-            {n: k for k, n in enumerate(self.traced.q.tolist())},
-        )
-        pattern = Pattern.of(
-            [(i, place[n]) for i, row in enumerate(entries) for n in row], (len(rows), len(place))
-        )
+        rows, entries = self.nodes.closures, self.nodes.of_closures
+        place = {n: k for k, n in enumerate(self.traced.q.tolist())}
+        places = [(i, place[n]) for i, row in enumerate(entries) for n in row]
+        pattern = Pattern.of(places, (len(rows), len(place)))
         slopes = [node for row in entries for node in row.values()]
 
         def look(q, which):
@@ -346,7 +334,7 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
 
 
 def _inverse_root(M: np.ndarray) -> np.ndarray:
-    """Return `L'^-1` with `M = L L'`, or the identity if M is singular; the projection is then Euclidean in
+    """Return `L'^-1` with `M = L L'`. For a singular M return the identity: a projection is then Euclidean in
     scaled speeds.
     """
     try:

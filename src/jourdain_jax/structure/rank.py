@@ -1,6 +1,6 @@
-"""The rank of constraints at probed states, and the redundant ones among them.
+"""The rank of constraints at probed states, and the redundant constraints.
 
-A^ = d A c,  M^ = c M c        rows and inertias in scaled speeds (`scaling.py`)
+A^ = d A c,  M^ = c M c        scaled rows, and inertias in scaled speeds (`scaling.py`)
 """
 
 import itertools
@@ -32,9 +32,8 @@ def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
-    return Scaled(
-        A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c
-    )
+    M = c[:, :, None] * found.M * c[:, None]
+    return Scaled(A / np.where(length > 0, length, 1), length[..., 0], M, c)
 
 
 def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
@@ -45,9 +44,8 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
     # smaller singular values are errors of the configuration, not of the rows
-    return np.sum(
-        sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1
-    ).tolist()
+    cutoff = np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None]
+    return np.sum(sigma > cutoff * sigma[:, :1], axis=1).tolist()
 
 
 def contradictions(
@@ -57,11 +55,11 @@ def contradictions(
     at_rest: Float[np.ndarray, "states rows"],
     ranks: list[int],
 ) -> Labels:
-    """Return a sentence on constraints that no speeds satisfy together at any of the random states.
+    """Return a sentence about constraints that no speeds satisfy together at any of the random states.
 
-        A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
+        A u + phi_0 = 0 has a solution if (1 - U U') phi_0 = 0,   A = U S V'
 
-    `A`, `at_rest`: scaled rows and their values phi_0 at u = 0, for constraints affine in the speeds.
+    `A`, `at_rest`: scaled rows, and their values phi_0 at u = 0, of constraints affine in the speeds.
     """
     U = np.linalg.svd(A, full_matrices=False)[0]
     U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
@@ -72,20 +70,17 @@ def contradictions(
         return ()
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
     idle = [name for name, s in wrong if not A[:, s].any()]
-    if idle:
-        return (
-            (
-                f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
-                "relations between coordinates in `geometric_constraints`"
-            ),
-        )
     several = ", ".join(f"`{name}`" for name, _ in wrong)
-    return (
-        (
-            f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of"
-            f" {len(A)} random states; omit or correct one"
-        ),
+    said = (
+        f"constraints {several} of `{who}` contradict each other: no speeds satisfy them at any of {len(A)} "
+        "random states; omit or correct one"
     )
+    if idle:
+        said = (
+            f"velocity constraint `{idle[0]}` of `{who}` depends on no speed and is not zero; state "
+            "relations between coordinates in `geometric_constraints`"
+        )
+    return (said,)
 
 
 def redundant_rows(
@@ -96,13 +91,13 @@ def redundant_rows(
     names: Labels,
     far: Callable[[], Scaled],
 ) -> Labels:
-    """Return rows that may be omitted, later ones first, so that the rest keeps its rank at every probed
-    state and is well conditioned.
+    """Return rows that may be omitted, later rows first: the others keep the rank at every probed state and
+    stay well conditioned.
 
-    An omitted row is a combination of the others, with bounded coefficients; large ones count as unbounded.
-    For example, the lateral row of one wheel is a combination of its longitudinal row and the other wheel's,
-    with tangents of the heading as coefficients. `generic`: which of the states `found` are random; `far`:
-    rows at angles far from them.
+    An omitted row is a combination of the others with bounded coefficients. This excludes, for example, the
+    lateral row of one wheel of an axle as a combination of its longitudinal row and rows of the other wheel,
+    whose coefficients are tangents of the heading. `generic`: which of the states `found` are random; `far`:
+    function that returns rows at distant angles.
     """
     if not ranks:  # no usable state is reported as another fault
         return ()
@@ -121,8 +116,8 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Return the coefficients that express row s by the rows `rest` at states of full rank, with rows in
-    units of their typical lengths. They are infinite where `rest` does not determine row s.
+    """Return the coefficients of row s as a combination of the rows `rest` at states of this rank, in units
+    of their typical lengths; infinite where row s is no combination.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)
@@ -131,17 +126,14 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
         if its_rank == rank:
             c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
             given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(eps_of(A))
-            made.append(
-                c * (length[s] / usual[s]) / (length[rest] / usual[rest])
-                if given
-                else np.full(len(rest), np.inf)
-            )
+            relative = c * (length[s] / usual[s]) / (length[rest] / usual[rest])
+            made.append(relative if given else np.full(len(rest), np.inf))
     return np.array(made).reshape(len(made), len(rest))
 
 
 def _are_bounded(c: np.ndarray) -> bool:
-    """Return whether coefficients stay bounded over many states. They do not if one is large, or exceeds its
-    usual size with both signs, as a tangent does.
+    """Return whether coefficients are bounded over many states: none is large, and none exceeds its usual
+    size with both signs, as a tangent does.
     """
     usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(eps_of(c))
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
@@ -149,8 +141,8 @@ def _are_bounded(c: np.ndarray) -> bool:
 
 
 def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Indices:
-    """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and unless
-    there are `freedoms` of them.
+    """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and for any
+    other number of names than `freedoms`.
     """
     check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
     chosen = tuple(
@@ -178,8 +170,8 @@ def pivots_at(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray
 
 
 def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
-    """Return the smallest pivot over the domain; zero if the determinant of A_z changes sign between probes,
-    since it vanishes in between.
+    """Return the smallest pivot over the domain. It is zero if the determinant of A_z changes sign between
+    probes.
     """
     if rank and scaled.shape[1] == rank:
         signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
@@ -189,7 +181,7 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
 
 
 def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
-    """Return the independent speeds with the largest worst pivot over all probes; the largest typical pivot
+    """Return the independent speeds with the largest worst pivot over all probes. The typical pivot
     breaks ties.
     """
     if rank == 0:
@@ -200,9 +192,8 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
 
     def merit(dependent, probes):
         pivots = pivots_at(probes, list(dependent), rank)
-        return round(worst_pivot(probes, list(dependent), rank, pivots), 6), round(
-            float(np.median(pivots)), 6
-        )
+        worst = worst_pivot(probes, list(dependent), rank, pivots)
+        return round(worst, 6), round(float(np.median(pivots)), 6)
 
     some = scaled[:: max(1, len(scaled) // 40)]
     best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:40]
@@ -211,7 +202,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
 
 
 def _greedy(A: np.ndarray, rank: int) -> Indices:
-    """Return columns chosen in turn by largest remaining length (pivoted QR)."""
+    """Return the columns that pivoted QR chooses: in turn, the one with the largest remaining length."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):
         lengths = np.linalg.norm(remaining, axis=0)

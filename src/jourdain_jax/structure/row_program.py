@@ -1,9 +1,8 @@
-"""Constraints of a class of scenes as a scalar program for projecting and checking starts: residuals, their
-derivatives, the mass matrix.
+"""Constraints of a class of scenes as a scalar program, for projections and checks of starts.
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
 
-Unit norms of quaternions count as geometric constraints.
+Unit norms of quaternions count as geometric constraints g.
 """
 
 from dataclasses import dataclass
@@ -30,8 +29,8 @@ Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
 
 @dataclass(frozen=True, eq=False)
 class RowProgram:
-    """Nodes of a graph, compared by identity, so that they can be a static argument of compiled functions.
-    Matrices are dictionaries by (row, column), without zeros.
+    """Nodes of a graph. A program is compared by identity, so it can be a static argument of compiled
+    functions.
     """
 
     graph: Graph
@@ -46,8 +45,9 @@ class RowProgram:
     A: Matrix
     M: Matrix | None  # lower triangle; None if too large to be written out
     right: int  # truth value: parameters and bodies are valid
-    # coordinates of other states, projected onto the geometric constraints, on which `right` also depends
-    others: Indices
+    others: (
+        Indices  # coordinates of other states, on the geometric constraints, on which `right` also depends
+    )
 
 
 @once_per_class
@@ -90,8 +90,9 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     which it depends.
 
     Parameters are valid if each is finite, has its required sign, and causes no fault of
-    `plausibility.CHECKS`. Faults independent of parameters are found when the scene is probed. If geometric
-    constraints depend on parameters, so do the coordinates of these states.
+    `plausibility.CHECKS` at the start and at states from `elsewhere`. The coordinates of these states depend
+    on parameters if the geometric constraints do. Faults that do not depend on parameters are found when the
+    scene is probed.
     """
     g, traced = looked.graph, looked.traced
     states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0

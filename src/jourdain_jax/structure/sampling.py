@@ -17,16 +17,22 @@ from jourdain_jax.structure.probes import Probed, sampled_on_graph
 
 GUESSES = 8  # of a start, of each kind
 NEARLY_INSIDE = 0.05  # in widths of the domain
+NOWHERE_FINITE = (
+    "; no constraint is finite anywhere: a contact has no point if a ball is larger than its "
+    "hollow cylinder or sphere, or if the gradient of a surface vanishes"
+)
 
 
 class NoStateFoundError(ValueError):
-    """Error for a domain without a state that satisfies the geometric constraints and has finite constraints."""
+    """Raised for a domain without a state that satisfies the geometric constraints and has finite
+    constraints.
+    """
 
 
 @of_known_numbers
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return at most `count` random admissible states (t, q, u) from the scene's domain, on the constraints,
-    each with a leading axis of states.
+    """Return at most `count` random states (t, q, u) from the scene's domain, on the constraints. Each array
+    has a leading axis of states.
 
     `seed`: of the generator. Raises ValueError if no state satisfies the geometric constraints, or if
     constraints are NaN at all such states. Raises DifferentiationModeError for traced parameters.
@@ -58,7 +64,7 @@ def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
     return NoStateFoundError(
         f"the constraints of `{type(scene).__name__}` are NaN at all of {count} random states, with "
         f"{', '.join(spans)}: a pose, a contact or a constraint is undefined there, such as the square root "
-        "of a negative number; state a `domain` inside which they are defined, as in `domain = "
+        "of a negative number; state a `domain` in which all are defined, as in `domain = "
         "{'x': (-0.1, 0.1)}`"
     )
 
@@ -66,7 +72,7 @@ def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
 def drawn_states(
     scene: Scene, count: int, generator: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield states from the domain, not yet projected; if these fail, states near the scene's example, if it
+    """Yield states from the domain, not yet projected, and then states near the scene's example, if it
     has one.
     """
     yield random_states(scene, count, generator)
@@ -79,8 +85,8 @@ def drawn_states(
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
-    """Return configurations to start from: near q, then `states` on the constraints (nearest in coordinates
-    that are not `free`), then elsewhere in the domain.
+    """Return configurations from which to search for a start: near q, then the `states` on the constraints
+    that are nearest in coordinates that are not `free`, then random ones in the domain.
     """
     on = array_module(q)
     q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
@@ -94,21 +100,14 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "gue
 
 
 def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:
-    """Return marks of usable states: on the geometric constraints to round-off and inside the domain. If few
-    random states are inside, the nearest ones count as well.
+    """Return which states are usable: on the geometric constraints to round-off, and inside the domain. If
+    few random states are inside, the nearest ones count as well.
 
     Raises ValueError if no random state satisfies the geometric constraints.
     """
     good = np.isfinite(found.error)
     if not good[generic].any():
-        nowhere = (
-            ""
-            if np.isfinite(found.position_error[generic]).any()
-            else (
-                "; no constraint is finite anywhere: a contact has no point if a ball is larger than its "
-                "hollow cylinder or sphere, or if the gradient of a surface vanishes"
-            )
-        )
+        nowhere = "" if np.isfinite(found.position_error[generic]).any() else NOWHERE_FINITE
         raise NoStateFoundError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the "
             f"geometric constraints by {np.min(found.position_error[generic]):.1e} or more; state a `domain` "
@@ -122,8 +121,8 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
-    """Return configurations with zero and right angles (within the domain) in one or two coordinates; for
-    scenes with many coordinates, in single ones of them.
+    """Return configurations of zeros, with right angles (within the domain) in up to two coordinates. Scenes
+    with many coordinates get right angles in one coordinate, for some of them.
     """
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()

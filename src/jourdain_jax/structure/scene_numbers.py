@@ -1,5 +1,5 @@
-"""Numbers of a scene at one state that `plausibility.py` checks: masses, inertias, unit vectors, lengths, gaps,
-velocities of grounds.
+"""Numbers of a scene at one state that `plausibility.py` checks: masses, inertias, unit vectors, lengths,
+gaps, velocities of grounds.
 """
 
 import jax
@@ -21,7 +21,7 @@ Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
 
 
 def numbers_of(scene: Scene, motion: Motion) -> Numbers:
-    """Return the numbers that the table checks, from known poses and velocities."""
+    """Return the checked numbers at the state of a motion."""
     pose = motion.pose()
     contacts = contacts_of(scene, pose)
     laws = {f"contact `{name}`": c.friction for name, c in contacts.items() if c.friction is not None}
@@ -41,7 +41,7 @@ def numbers_of(scene: Scene, motion: Motion) -> Numbers:
 
 
 def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers:
-    """Return the numbers of poses and loads at one state."""
+    """Return the checked numbers that depend on poses and loads only."""
     bodies = {f"body `{name}`": body.body for name, body in pose.bodies.items()}
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
@@ -115,10 +115,11 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     """Return velocities (m/s) of the ground of every contact.
 
-    "plane": velocities of the contact's plane along its normal, from origin and tilt and from velocity and
-    angular velocity, with an upper bound. A plane tangent to a ground at rest has none. "own plane": the same
-    for a `Contact` with a user-defined point. "ground": the rates of all numbers that describe the ground,
-    due to the motion of other bodies, and the ground's stated velocity.
+    - "plane": two velocities of the contact's plane along its normal, by `origin` and `tilt` and by
+      `velocity` and `angular_velocity`, and the sum of the sizes of their terms.
+    - "own plane": the same for a `Contact` with a user-defined point.
+    - "ground": the rates of all numbers of the ground due to the motion of other bodies, relative to the
+      speeds of these, and the ground's stated velocity.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())

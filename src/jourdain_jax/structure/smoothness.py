@@ -1,13 +1,13 @@
-"""Smoothness of the motion of bodies: where the velocity of a pose jumps, its second derivative and with it
-the inertia force is lost.
+"""Smoothness of the motion of bodies. Where the velocity of a pose jumps, the second derivative does not show
+it, and the impulse of the jump is lost.
 
-    r(t, q), R(t, q), g(t, q)      once continuously differentiable; otherwise the impulse of a jump is lost
-    qdot(t, q, u)                  continuous, for the same reason
-    phi(t, q, 0)                   continuous in time: if it jumps and A does not, speeds would have to jump
+    r(t, q), R(t, q), g(t, q)      must be continuously differentiable in time and coordinates
+    qdot(t, q, u)                  must be continuous
+    phi(t, q, 0)                   must be continuous in time: if it jumps and A does not, speeds would jump
 
-A piecewise linear interpolation has a second derivative of zero at every evaluated point. Branches and calls
-of JAX that affect these quantities are therefore evaluated along lines in t and q, to find jumps of the
-quantity or its rate: r, R and g, and v, omega and dg/dt at some speeds.
+A piecewise linear interpolation, for example, has a second derivative of zero at every evaluated point.
+Quantities that branches or calls of JAX affect are therefore evaluated along lines in t and q, to find jumps:
+of r, R and g, and of v, omega and dg/dt at some speeds.
 """
 
 from collections import Counter
@@ -31,22 +31,16 @@ SPEEDS_WOULD_JUMP = (
 
 
 def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
-    """Return one sentence for each body, constraint or coordinate that jumps or whose velocity jumps; `q`,
-    `u`: some states.
+    """Return one sentence for each body, constraint or coordinate that jumps or has a velocity that jumps.
+    `q`, `u`: some states.
     """
     nodes = looked_at(scene)
     at, geometric = nodes.traced.at, len(nodes.traced.at.closure)
-    smooth = owned(
-        scene,
-        **{
-            name: getattr(at, name)
-            for name in ("position", "orientation", "v", "omega", "closure", "phi", "qdot")
-        },
-    )
+    fields = "position", "orientation", "v", "omega", "closure", "phi", "qdot"
+    smooth = owned(scene, **{name: getattr(at, name) for name in fields})
     # values of velocity constraints, which must be continuous in time
-    rows = dict(
-        zip(nodes.vanishing["rows at rest"][geometric:], names_of_rows(scene)[geometric:], strict=True)
-    )
+    at_rest = nodes.vanishing["rows at rest"][geometric:]
+    rows = dict(zip(at_rest, names_of_rows(scene)[geometric:], strict=True))
     if not any(passes(nodes.graph, smooth | rows, NONANALYTIC | CALLS)):
         return ()
 
@@ -66,16 +60,16 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
     for node, sides in met([*smooth, *rows], *_in_time(scene, q)):
         if node in smooth:
             found.setdefault(smooth[node], _said(scene, smooth[node], f"at t = {sides[1, 0]:.6g} s"))
-        # if A changes too, a state may satisfy both
-        elif np.allclose(
-            *values([n for row in nodes.rows for n in row.values()], sides), rtol=1e-6, atol=1e-9
-        ):
+            continue
+        # if A changes too, a state may satisfy the constraint on both sides
+        A = values([n for row in nodes.rows for n in row.values()], sides)
+        if np.allclose(*A, rtol=1e-6, atol=1e-9):
             found.setdefault(
                 rows[node],
                 f"constraint `{rows[node]}` of `{type(scene).__name__}` jumps at t "
                 f"= {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}",
             )
-    # three kinks along coordinates indicate a look-up table; a single one may lie off any motion
+    # three kinks along coordinates indicate a look-up table; no motion may reach a single one
     for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(scene, q))).items():
         if count >= 3:
             found.setdefault(name, _said(scene, name, "at several places on its way"))
@@ -83,8 +77,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
 
 
 def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return intervals of time, each with one of the states `q`: 192 in the usual span, and others around the
-    numbers in the scene's arrays (up to 128 of each), which may be sample times.
+    """Return intervals of time, each with one of the states `q`: 192 in the usual span, and up to 128 between
+    the numbers of each of the scene's arrays, which may be sample times.
     """
     span = float(scene.example_span)
     t = np.linspace(1e-6 * span, span, 193)
@@ -94,9 +88,8 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         knots = knots[np.isfinite(knots)]
         if knots.size >= 2:
             middle = (knots[:-1] + knots[1:]) / 2
-            chosen = np.unique(
-                np.linspace(0, max(knots.size - 3, 0), min(128, max(knots.size - 2, 1))).astype(int)
-            )
+            count = min(128, max(knots.size - 2, 1))
+            chosen = np.unique(np.linspace(0, max(knots.size - 3, 0), count).astype(int))
             low.append(middle[chosen] if knots.size > 2 else knots[:1])
             high.append(middle[chosen + 1] if knots.size > 2 else middle)
     low, high = np.concatenate(low), np.concatenate(high)
@@ -107,9 +100,9 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return intervals on 6 lines across the bounding box of the states `q`, 48 on each, at random times.
 
-    The lines are projected onto the geometric constraints: elsewhere, as inside a body that others roll on, a
-    constraint may jump at states that no motion reaches. Intervals with an end that does not converge, or
-    with ends at distant places, are omitted.
+    The lines are projected onto the geometric constraints. Off them a constraint may jump at states that no
+    motion reaches, as inside a body that others roll on. Intervals with an end that does not converge, or
+    with ends far apart, are omitted.
     """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))

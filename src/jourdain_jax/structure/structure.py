@@ -3,8 +3,8 @@ constraints.
 
 Random states are drawn from the scene's domain. Symmetric configurations (zero and right angles) are added,
 since partitions that are regular at random states may be singular there. All are projected onto the geometric
-constraints. Probing uses concrete numbers even while a scene's parameters are traced (numbers near the
-class's defaults), so that the choice is static.
+constraints. Traced parameters are replaced by numbers near the class's defaults, so that decisions are
+static.
 """
 
 from collections.abc import Iterable, Iterator
@@ -60,7 +60,7 @@ class Structure:
     rank: int  # at generic states
     ranks: tuple[int, ...]  # at all probed states
     redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
-    may_set_in: Labels  # those of them that may be independent away from the probes
+    may_set_in: Labels  # redundant rows that may be independent away from the probes
     rank_losses: Labels  # probed configurations with fewer independent rows, as text
     independent: Indices  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
@@ -162,10 +162,10 @@ def structure_of(scene: Scene) -> Structure:
     """Return static facts about a scene: rank of its constraints, privileged velocities and their
     conditioning, kinds of constraints; eqs. (25)-(31).
 
-    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers
-    replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not move
-    smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For known
-    parameters, raises it also for impossible numbers of bodies or planes, and for contradictory constraints.
+    They are found once per class and parameter values, at random and symmetric states of the domain. Concrete
+    numbers replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not
+    move smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For
+    known parameters, impossible numbers of bodies or planes and contradictory constraints also raise it.
     """
     structure = structure_whatever_its_faults(scene)
     # replaced parameters prove nothing about bodies and grounds
@@ -180,13 +180,13 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
 
 
 def is_judged(scene: Scene) -> bool:
-    """Return whether the parameters of a scene are known, so that findings at its probed states apply to it."""
+    """Return whether the parameters of a scene are known, so that findings at probed states apply to it."""
     return not is_traced(scene)
 
 
 def trust(scene: Scene) -> float:
-    """Return the weight of typical lengths: 1, or 0.001 for traced parameters, whose true values may have
-    another magnitude.
+    """Return the weight of typical lengths: 1 for known parameters, 0.001 for traced parameters, whose values
+    may have another magnitude.
     """
     return 1.0 if is_judged(scene) else 1e-3
 
@@ -197,8 +197,8 @@ def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
-    """Return typical lengths of the geometric rows (of their rates) and of quaternion norms in the
-    coordinates, for `project_positions`.
+    """Return typical lengths of the rows of G, with the unit norms of quaternions, for
+    `project_positions`.
     """
     geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
     return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
@@ -225,10 +225,8 @@ def _probed_structure(scene: Scene) -> Structure:
             break
     on_rows = usable_states(scene, found, generic)
     numbers = at_index(found.numbers, on_rows)
-    rough, (grounds, bodies, faults) = (
-        kinks(scene, found.q[on_rows & generic], u),
-        (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults")),
-    )
+    rough = kinks(scene, found.q[on_rows & generic], u)
+    grounds, bodies, faults = (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
     A = found.A * speed_scales(found.M)[:, None]
     usable = all_finite(A, axis=(1, 2)) & on_rows
     if not faults and not usable.any():
@@ -257,11 +255,10 @@ def _probed_structure(scene: Scene) -> Structure:
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
-    independent = (
-        best_privileged(candidates, count, rank)
-        if by_user is None
-        else named_speeds(scene, by_user, count - rank)
-    )
+    if by_user is None:
+        independent = best_privileged(candidates, count, rank)
+    else:
+        independent = named_speeds(scene, by_user, count - rank)
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(eps_of(found.A)), found.unproved
@@ -272,7 +269,7 @@ def _probed_structure(scene: Scene) -> Structure:
     affine = "nonlinear" not in unproved and not exceeds(
         found.A - found.A_other, np.sqrt(eps), sizes(found)[..., None]
     )
-    # near round-off: integrating zero work does less harm than omitting work
+    # a tolerance near round-off, because integrating zero work does less harm than omitting work
     homogeneous = "rows at rest" not in unproved and not exceeds(at_rest, 32 * eps, speed_terms(found, u))
     rows_of_inputs = acts("rows of inputs")
     # smaller numbers may be errors of tables and iterations
@@ -349,11 +346,11 @@ class Reference:
     """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
 
     Two references are equal if their scenes lead to the same decisions (`Structure.decisions`), and then
-    share one program. So the arguments of a call determine its program, not the order of calls. Parameters
-    that are already traced are replaced by the class's defaults.
+    share one program. The arguments of a call thus determine its program, not the order of calls. Numbers
+    near the class's defaults replace parameters that are traced already.
 
-    `varied`: names of parameters that differ within a batch (None: all). They are replaced by numbers nearby,
-    so that coincidences do not count.
+    `varied`: names of parameters that differ within a batch (None: all). Numbers nearby replace them, so that
+    equal numbers by coincidence do not count.
     """
 
     def __init__(self, scene: Scene, varied: Iterable[str] | None = None):

@@ -8,8 +8,8 @@ derivative.
     c                                    stop events
     T, V                                 energies
 
-The same graph serves probing (`probed_on_graph`) and lowering. Traces are cached per class and shapes of the
-parameters.
+The same graph is used for probes (`probed_on_graph`) and for lowering. Traces are cached per class and shapes
+of the parameters.
 """
 
 from collections.abc import Callable
@@ -76,8 +76,7 @@ class VelocityQuantities(eqx.Module):
     # projected onto the constraints of closed contacts; empty without switching contacts
     held: Num[Entries, "coordinates_and_speeds"]
     start: Num[Entries, "numbers"]  # `switching.Begun`
-    # of switching contacts, from which the others follow: after the coordinates, speeds and inputs at which
-    # they hold
+    # for each state of switching contacts: coordinates, speeds, inputs, and the response (`ContactResponse`)
     responses: Num[Entries, "states numbers"]
 
 
@@ -113,11 +112,11 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 def velocity_quantities(
     scene: Scene, motion: Motion, of_inputs: Indices = (), with_events: bool = True
 ) -> VelocityQuantities:
-    """Return the traced quantities, evaluated at numbers; `of_inputs`: indices of the loads whose potential
-    depends on inputs.
+    """Return the traced quantities at a motion. `of_inputs`: indices of the loads whose potential depends on
+    inputs.
     """
     at = At(scene, motion) if scene.switching.contacts else None
-    # once: evaluated twice, a callback would count as two
+    # once, because a callback that is evaluated twice counts as two
     stated = loads_at(scene, motion, at.found if at else None)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(
@@ -146,7 +145,7 @@ def velocity_quantities(
 
 
 def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Array, "events"]:
-    """Return values of the events, sorted by name; `at`: switching contacts, if already known."""
+    """Return values of the events, sorted by name. `at`: switching contacts, if already known."""
     values = {name: event.value for name, event in events_of(scene, motion).items()}
     if scene.switching.contacts:
         values |= contact_events(at or At(scene, motion))
@@ -156,10 +155,8 @@ def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Ar
 def event_resets(
     scene: Scene, motion: Motion, of_inputs: Indices, at: At | None = None
 ) -> Float[Array, "events rows"]:
-    """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the stored
-    energy of the loads `of_inputs`.
-
-    The arrays are empty if all events stop the motion.
+    """Return a row for each event, sorted by name: coordinates, speeds and modes after it, and the rise of
+    the stored energy of the loads `of_inputs`. Rows are empty if all events stop the motion.
     """
     every = events_of(scene, motion) | (
         contact_changes(at or At(scene, motion)) if scene.switching.contacts else {}
@@ -222,13 +219,13 @@ class TracedScene(Variables):
 
     @property
     def motion(self) -> list[np.ndarray]:
-        """Return the functions of the state, from poses and constraints, whose derivatives are needed."""
+        """Return the quantities of poses and constraints whose derivatives are needed."""
         at = self.at
         return [at.v, at.omega, at.position, at.orientation, at.mass, at.inertia, at.phi, at.closure, at.qdot]
 
 
 def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
-    """Return the scene as a new graph. Parts without a scalar form, or with a user-defined derivative, are
+    """Return the scene as a new graph. Parts without scalar form, or with a user-defined derivative, are
     calls.
 
     `of_inputs`: indices of the loads whose potential depends on inputs.
@@ -243,8 +240,8 @@ def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
 
 
 def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
-    """Return a jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u
-    and inputs, and their shapes.
+    """Return a jaxpr of the scene's quantities, and their shapes. It is a function of the parameters (one
+    input per leaf), t, q, u and inputs.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError if a method reads a
     value that JAX traces elsewhere.
@@ -254,8 +251,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
 
 @once_per_class
 def _traced(scene: Scene, of_inputs: Indices) -> tuple:
-    """Return the jaxpr with its shapes, and the scene on a graph that must not be changed, or the name of the
-    operation without a scalar form.
+    """Return the jaxpr with its shapes, and the scene on a graph that must not be changed. In place of the
+    graph return the name of an operation without scalar form.
     """
     closed, shape = _jaxpr(scene, of_inputs)
     try:
@@ -333,14 +330,11 @@ def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
 
 
 def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
-    """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`. If owners share a
-    node, the first counts.
+    """Return node -> name of its owner, for nodes of some fields of `VelocityQuantities`; for shared nodes,
+    the first owner.
     """
-    of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {
-        "mass": "mass of",
-        "inertia": "inertia of",
-    }
-    of_bodies |= {"force": "force on", "torque": "torque on"}
+    of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of")
+    of_bodies |= {"mass": "mass of", "inertia": "inertia of", "force": "force on", "torque": "torque on"}
     named = {
         field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)]
         for field, what in of_bodies.items()
