@@ -37,7 +37,9 @@ def chosen(arguments):
 
 
 def measure(arguments) -> list[dict]:
-    """All cells in the floating-point type of this process; what there is so far is written after every case."""
+    """All cells in the floating-point type of this process; what there is so far is written after every
+    case.
+    """
     from atlas_cases.run import cells
 
     found: list[dict] = []

@@ -166,7 +166,9 @@ def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
 
 
 def reaching() -> dict[str, list[str]]:
-    """Return the private modules that every test file reaches, by the name of the file, where there are any."""
+    """Return the private modules that every test file reaches, by the name of the file, where there are
+    any.
+    """
     known: dict[Path, set[str]] = {}
     found = {
         path.name: sorted(private_modules(path, known)) for path in sorted((ROOT / "tests").glob("test_*.py"))

@@ -3,8 +3,8 @@ from which starts a bicycle falls.
 
     python bench/ensemble_cases.py [--quick] [--only NAME ...] [--json FILE] [--out DIR]
 
-    stability   100,000 samples of one bicycle's 25 measured parameters: share of them that is self-stable at each speed, and total Sobol' indices of the
-                weave speed
+    stability   100,000 samples of one bicycle's 25 measured parameters: share of self-stable samples at each
+                speed, and total Sobol' indices of the weave speed
     rides       1,000,000 rides of 5 s from random leans and speeds: where the bicycle falls
 
 Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures

@@ -7,13 +7,19 @@ The motions: two seconds of a rolling disc with random lean, yaw, lean and spin 
 a tolerance of 1e-6; end values, result codes and steps are stored. Every measurement runs in a fresh process,
 and a program is compiled before the clock starts.
 
-    rate        discs per second, storage included (wall time; and per second of processor time, where other programs share the machine)
-    storage     processor time within the writing of chunks, of that of the whole run
-    busy        steps of all lanes over steps for which lanes of a vector are there, if lanes that end are replaced at once; and without replacement
-    memory      growth of the largest resident memory from fewer to more lanes; and the largest under a stated bound
-    processes   wall time by one process on one core over that by two processes on two, and by two workers of a Dask cluster on this machine
-    bits        arrays and statistics that differ between runs with other chunks, by two processes, interrupted, and the plain one
-    kills       lanes computed again, of all lanes, and missing or repeated ones, of a long run that is killed 20 times at random
+    rate        discs per second, storage included: of wall time, and of processor time where other programs
+                share the machine
+    storage     share of processor time for the writing of chunks
+    busy        steps of all lanes over steps of the lanes of a vector, with and without replacement of lanes
+                that end
+    memory      growth of the largest resident memory from fewer to more lanes; and the largest under a stated
+                bound
+    processes   wall time of one process on one core over that of two processes on two, and over that of two
+                workers of a Dask cluster on this machine
+    bits        arrays and statistics that differ from a plain run: with other chunks, by two processes,
+                interrupted
+    kills       share of lanes computed again, and missing or repeated lanes, of a long run that is killed 20
+                times at random
     indices     largest error of Sobol' indices of Ishigami's function over their stated limits
 
 The JSON is a list of {"figure", "model", "value", "required", "met"}. `--quick`: a tenth of the lanes.
@@ -108,7 +114,8 @@ def logged(lanes: int, folder: Path, log: Path) -> StudyResult:
 CALL = """
 import ensembles, json, pathlib, sys
 told = json.loads(sys.argv[2])
-print(json.dumps(getattr(ensembles, sys.argv[1])(folder=pathlib.Path(told.pop("folder")), **told), default=str))
+folder = pathlib.Path(told.pop("folder"))
+print(json.dumps(getattr(ensembles, sys.argv[1])(folder=folder, **told), default=str))
 """
 
 

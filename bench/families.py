@@ -32,14 +32,17 @@ TURN = {
     "rear_spin_rate": 17.191526326526,
 }  # at a lean of 0.4 rad
 COLD = {  # a call, the most that it may take, s, and what it is called on
-    "closed curve of turns, cold": ('jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})', 3.0, ""),
+    "closed curve of turns, cold": (
+        'jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})', 3.0, "",
+    ),
     "linearize, first call after the start": ('jj.linearize(bicycle, start, ("lean", "steer"))', 1.5, ""),
     "derivatives of eigenvalues by all parameters, first call": (
         'small.sensitivities("weave")', 1.5, 'small = jj.linearize(bicycle, start, ("lean", "steer"))',
     ),
     "derivative of the weave speed by the trail, first call": (
         'jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(bicycle.c)', 3.0,
-        'straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3}, until={"x_rate": 1.0})',
+        'rates = {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3}\n'
+        'straight = jj.family(bicycle, rates, until={"x_rate": 1.0})',
     ),
     "chart of 101 trails against the speed, cold": (
         'jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (5.0, 35.0)})', 5.0, "",
@@ -58,7 +61,7 @@ NAME = "whipple-bicycle"
 
 
 def cold(quick: bool) -> Figures:
-    """Processor time of calls in fresh processes; imports, a start, and what they are called on are left out."""
+    """Processor time of calls in fresh processes, without imports, a start and earlier calls."""
     for name, (code, required, first) in list(COLD.items())[: 2 if quick else 5]:
         yield figure(name, NAME, fresh(PROGRAM.format(first, code)), required)
 

@@ -83,7 +83,9 @@ SPREAD = {"disc": (-6.0, -3.0), "bicycle": (0.1, 0.5)}
 
 
 def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
-    """Every call of machine code in `f` of so many spread lanes on the CPU, with its arguments and results."""
+    """Every call of machine code in `f` of so many spread lanes on the CPU, with its arguments and
+    results.
+    """
     calls: list[tuple] = []
 
     def lowered(ctx, *values, handler, lanes, threads, operands, **how):
@@ -162,7 +164,9 @@ def alone(
 
 
 def study(lanes: int, least: float | None, quick: bool) -> Figures:
-    """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is stored."""
+    """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is
+    stored.
+    """
     of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": Uniform(*SPREAD["disc"])}, samples=lanes)
     with tempfile.TemporaryDirectory() as folder:
         run = partial(

@@ -224,14 +224,17 @@ def coverage(quick: bool) -> Figures:
 # known), sigma of each channel, and times
 THREE = {
     DISC: (
-        TiltingDisc(), {"radius": 0.51, "gravity": 10.0}, (START, {"lean": 0.2, "spin_rate": -4.0}), {"lean": 0.005, "x": 0.005}, np.linspace(0.0, 2.0, 101),
+        TiltingDisc(), {"radius": 0.51, "gravity": 10.0}, (START, {"lean": 0.2, "spin_rate": -4.0}),
+        {"lean": 0.005, "x": 0.005}, np.linspace(0.0, 2.0, 101),
     ),
     "chaplygin-sleigh": (
-        ChaplyginSleigh(), {"inertia": 0.42, "offset": 0.26}, ({"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.8, "heading_rate": 0.4}),
+        ChaplyginSleigh(), {"inertia": 0.42, "offset": 0.26},
+        ({"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.8, "heading_rate": 0.4}),
         {"x": 0.01, "heading": 0.01}, np.linspace(0.0, 8.0, 101),
     ),
     "double-pendulum": (
-        DoublePendulumAngles(), {"mass2": 0.75, "length2": 0.82}, ({"theta1": 0.6, "theta2": 0.2}, {"theta1": -0.2, "theta2": 0.5}),
+        DoublePendulumAngles(), {"mass2": 0.75, "length2": 0.82},
+        ({"theta1": 0.6, "theta2": 0.2}, {"theta1": -0.2, "theta2": 0.5}),
         {"theta1": 0.01, "theta2": 0.01}, np.linspace(0.0, 4.0, 101),
     ),
 }  # fmt: skip

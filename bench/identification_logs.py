@@ -39,8 +39,10 @@ class SteerByWire(WhippleBicycle):
 # nominal parameters of the authors' models; the front frame turns the motor with it, whose inertia is a first
 # guess
 NOMINAL = {
-    "w": 1.036, "c": 0.0803, "lam": float(np.deg2rad(18.2)), "rR": 0.3498, "mR": 10.12, "IRxx": 0.1040, "IRyy": 0.1641, "xB": 0.462, "zB": -0.698, "mB": 20.9,
-    "IBxx": 1.64, "IByy": 2.0, "IBzz": 1.94, "IBxz": 0.654, "xH": 0.944, "zH": -0.595, "mH": 0.6, "IHxx": 0.1, "IHyy": 0.1, "IHzz": 0.1, "IHxz": -0.00044,
+    "w": 1.036, "c": 0.0803, "lam": float(np.deg2rad(18.2)), "rR": 0.3498, "mR": 10.12, "IRxx": 0.1040,
+    "IRyy": 0.1641, "xB": 0.462, "zB": -0.698, "mB": 20.9,
+    "IBxx": 1.64, "IByy": 2.0, "IBzz": 1.94, "IBxz": 0.654, "xH": 0.944, "zH": -0.595, "mH": 0.6, "IHxx": 0.1,
+    "IHyy": 0.1, "IHzz": 0.1, "IHxz": -0.00044,
     "rF": 0.3498, "mF": 1.780, "IFxx": 0.0644, "IFyy": 0.1289,
 }  # fmt: skip
 FREE = dict.fromkeys(("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c")) | {

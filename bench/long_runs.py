@@ -37,7 +37,9 @@ TOLERANCES = [10.0**-k for k in range(3, 14)]
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A scene, a step (s), its integral besides the energy, and which structure-preserving methods are run."""
+    """A scene, a step (s), its integral besides the energy, and which structure-preserving methods are
+    run.
+    """
 
     name: str
     scene: jj.Scene

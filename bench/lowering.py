@@ -157,7 +157,9 @@ AT_MOST = {"tilting-disc": 4, "whipple-bicycle": 6}  # solves
 
 
 def final_losses(name: str) -> tuple[Callable, np.ndarray]:
-    """A loss of the final coordinates of every lane, as a function of eight numbers each; the eight numbers."""
+    """A loss of the final coordinates of every lane, as a function of eight numbers each; the eight
+    numbers.
+    """
     scene = jj.models.MODELS[name]()
     span, parameters, of_q, of_u = BY_EIGHT[name]
     start = jj.start(

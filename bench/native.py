@@ -1,7 +1,9 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone,
 derivatives.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|single|laws ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only PART ...]
+
+PART: batches, heyoka, records, times, watching, calls, single, laws.
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only
 told. Times of warm motions are processor time, the least of some repeats, the two ways in turn.

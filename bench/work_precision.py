@@ -1,7 +1,8 @@
 """Work-precision charts: error against time for four problems, this engine's methods and its peers, each at
 its best settings.
 
-    taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...] [--part NAME ...]
+    taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...]
+        [--part NAME ...]
     python bench/work_precision.py --redraw FILE --out DIR
 
 Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained

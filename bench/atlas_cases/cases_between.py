@@ -176,19 +176,33 @@ FAR = {"k": 1e6, "x": 0.7, "x_rate": 300.0, "t0": 1.7e9, "span": 0.05}
 GROWING, LATE = {"x": 5.3, "x_rate": 0.1, "span": 1.0}, {"late": 6.0, "speed": 0.3, "span": 10.0}
 CASES = (
     required(
-        "E25", "a stiff motion ends at a stop event", partial(of_family, "stiff-drop", STIFF, 3, NO_ROWS_SKIP, asked=("rollout", "Radau IIA")), 1e-5, 2e-2,
+        "E25", "a stiff motion ends at a stop event",
+        partial(of_family, "stiff-drop", STIFF, 3, NO_ROWS_SKIP, asked=("rollout", "Radau IIA")), 1e-5, 2e-2,
         "rtol 1e-9 over 5,000 steps of order 5; the reference leaves out k^-3",
     ),
-    required("E26", "a singular partition between two saved times: a pendulum in x, z", partial(rod_pendulum, 1), 1e-6, 2e-2, OF_TOLERANCE),
-    required("E26 in step", "the same, saved once per turn", partial(rod_pendulum, 3), 1e-6, 2e-2, OF_TOLERANCE),
-    Case("E27", "a parallelogram linkage laid flat between saved times", parallelogram, 1e-5, 5e-2, OF_TOLERANCE + "; digits are lost near the crossing"),
-    Case("E28", "a slider-crank with r = l through right angles", slider_crank, 1e-5, 5e-2, OF_TOLERANCE + "; digits are lost near the crossing"),
     required(
-        "E29", "two stop events in one step: the earlier one counts", partial(of_family, "room", FLIGHT, 1, NO_ROWS_SKIP, asked=("rollout",)), 1e-8, 1e-4,
+        "E26", "a singular partition between two saved times: a pendulum in x, z", partial(rod_pendulum, 1),
+        1e-6, 2e-2, OF_TOLERANCE,
+    ),
+    required(
+        "E26 in step", "the same, saved once per turn", partial(rod_pendulum, 3), 1e-6, 2e-2, OF_TOLERANCE,
+    ),
+    Case(
+        "E27", "a parallelogram linkage laid flat between saved times", parallelogram, 1e-5, 5e-2,
+        OF_TOLERANCE + "; digits are lost near the crossing",
+    ),
+    Case(
+        "E28", "a slider-crank with r = l through right angles", slider_crank, 1e-5, 5e-2,
+        OF_TOLERANCE + "; digits are lost near the crossing",
+    ),
+    required(
+        "E29", "two stop events in one step: the earlier one counts",
+        partial(of_family, "room", FLIGHT, 1, NO_ROWS_SKIP, asked=("rollout",)), 1e-8, 1e-4,
         OF_TOLERANCE,
     ),
     required(
-        "E30", "an event value that is no number beyond its boundary", partial(of_family, "stop-arcsine", STOP, 1, NO_ROWS_SKIP), 1e-6, 1e-2,
+        "E30", "an event value that is no number beyond its boundary",
+        partial(of_family, "stop-arcsine", STOP, 1, NO_ROWS_SKIP), 1e-6, 1e-2,
         OF_TOLERANCE + "; the value falls as a root",
     ),
     required("E31", "a hammer blow of 1 ms in ten seconds", hammer_blow, 1e-6, 1e-2, OF_TOLERANCE),
@@ -196,11 +210,21 @@ CASES = (
         "E32", "an oscillator at a time of 1.7e9 s", far_oscillator, 2e-5, 1e-2,
         OF_TOLERANCE + "; saved times are rounded to 2e-7 s, a phase of 2e-4 rad per second of it",
     ),
-    required("E33", "a force with a coefficient of 1e-24 that grows", partial(of_family, "tiny-force", GROWING, 1, NO_ROWS_SKIP), 1e-6, 1e-2, OF_TOLERANCE),
-    Case("E34", "a row that sets in after six seconds", partial(of_family, "late-row", LATE, 5, ROWS_SKIP), 1e-5, 1e-2, OF_TOLERANCE),
+    required(
+        "E33", "a force with a coefficient of 1e-24 that grows",
+        partial(of_family, "tiny-force", GROWING, 1, NO_ROWS_SKIP), 1e-6, 1e-2, OF_TOLERANCE,
+    ),
+    Case(
+        "E34", "a row that sets in after six seconds", partial(of_family, "late-row", LATE, 5, ROWS_SKIP),
+        1e-5, 1e-2, OF_TOLERANCE,
+    ),
     unanswered(
-        "E35", "a pose by linear interpolation: no inertia", partial(of_family, "wagon-sampled", SAMPLED, 3, NO_ROWS_SKIP),
+        "E35", "a pose by linear interpolation: no inertia",
+        partial(of_family, "wagon-sampled", SAMPLED, 3, NO_ROWS_SKIP),
         "its accelerations are zero almost everywhere",
     ),
-    Case("E36", "an edge of a potential, 1e-6 m wide, that steps pass over", steep_edge, 1e-5, 1e-2, OF_TOLERANCE),
+    Case(
+        "E36", "an edge of a potential, 1e-6 m wide, that steps pass over", steep_edge, 1e-5, 1e-2,
+        OF_TOLERANCE,
+    ),
 )  # fmt: skip

@@ -391,7 +391,9 @@ def switched_turntable() -> Motion:
 
 
 def sleigh_backwards() -> Motion:
-    """The sleigh from its end back to its start: the forward motion contracts, so that errors grow 700 times."""
+    """The sleigh from its end back to its start: the forward motion contracts, so that errors grow 700
+    times.
+    """
     run, scene, ts = chaplygin_sleigh.RUN, jj.models.ChaplyginSleigh(), np.linspace(12.0, 0.0, 7)
     known = {name: values[::-1] for name, values in chaplygin_sleigh.motion(ts[::-1], **run).items()}
     first = {name: values[0] for name, values in known.items()}
@@ -405,33 +407,77 @@ LONG_DRIFT = 2e-2, "rtol of every step adds up over the run (1e-11 in float64, 1
 NEAR_FLAT = "round-off of the attitude counts 1/theta^2 in the contact's motion"
 DRIFTS, SOFT = "residuals", "a soft row yields by its force over k"
 CASES = (
-    required("E9", "drift off the rows in 100 s of a disc", partial(disc_for_long, 100.0), 1e-10, 1e-4, DRIFTS),
-    Case("E9 short", "drift off the rows in 10 s of a disc", partial(disc_for_long, 10.0), 1e-10, 1e-4, DRIFTS),
-    required("E9 long", "drift off the rows in 1000 s of a disc", partial(disc_for_long, 1000.0), 1e-10, 1e-4, DRIFTS),
-    required("E9 four-bar", "drift off the rows in 100 s of a four-bar linkage", four_bar, 1e-10, 1e-4, DRIFTS),
-    Case("E10", "stabilisation against projection: 2 s of a disc", disc_to_its_reference, 1e-7, 1e-3, "a run at rtol = atol = 1e-8 (float32: 1e-5, 1e-6)"),
-    Case("E11", "a linkage through its singular configuration", linkage, 1e-6, 1e-2, "rtol 1e-12; errors grow as the inverse square of the distance to it"),
-    required("E12", "gimbal lock: a rattleback on its edge, quaternion", celt_on_edge, 1e-9, 1e-2, "a fall from an edge amplifies errors"),
+    required(
+        "E9", "drift off the rows in 100 s of a disc", partial(disc_for_long, 100.0), 1e-10, 1e-4, DRIFTS,
+    ),
     Case(
-        "E12 angles", "the same in angles, which are singular there", celt_on_edge_in_angles, 1e-9, 1e-2, "rates of angles are infinite at the start",
+        "E9 short", "drift off the rows in 10 s of a disc", partial(disc_for_long, 10.0), 1e-10, 1e-4, DRIFTS,
+    ),
+    required(
+        "E9 long", "drift off the rows in 1000 s of a disc", partial(disc_for_long, 1000.0), 1e-10, 1e-4,
+        DRIFTS,
+    ),
+    required(
+        "E9 four-bar", "drift off the rows in 100 s of a four-bar linkage", four_bar, 1e-10, 1e-4, DRIFTS,
+    ),
+    Case(
+        "E10", "stabilisation against projection: 2 s of a disc", disc_to_its_reference, 1e-7, 1e-3,
+        "a run at rtol = atol = 1e-8 (float32: 1e-5, 1e-6)",
+    ),
+    Case(
+        "E11", "a linkage through its singular configuration", linkage, 1e-6, 1e-2,
+        "rtol 1e-12; errors grow as the inverse square of the distance to it",
+    ),
+    required(
+        "E12", "gimbal lock: a rattleback on its edge, quaternion", celt_on_edge, 1e-9, 1e-2,
+        "a fall from an edge amplifies errors",
+    ),
+    Case(
+        "E12 angles", "the same in angles, which are singular there", celt_on_edge_in_angles, 1e-9, 1e-2,
+        "rates of angles are infinite at the start",
         flag_is_right=True,
     ),
-    required("E13", "norm of the quaternion: a free top for 100 s", partial(free_top, 100.0), 1e-9, *LONG_DRIFT),
-    required("E13 long", "norm of the quaternion: a free top for 10,000 s", partial(free_top, 1e4), 1e-7, 0.1, LONG_DRIFT[1]),
+    required(
+        "E13", "norm of the quaternion: a free top for 100 s", partial(free_top, 100.0), 1e-9, *LONG_DRIFT,
+    ),
+    required(
+        "E13 long", "norm of the quaternion: a free top for 10,000 s", partial(free_top, 1e4), 1e-7, 0.1,
+        LONG_DRIFT[1],
+    ),
     required("E13 ball", "an eccentric ball rolls for 50 s", eccentric_ball, 1e-9, *LONG_DRIFT),
-    Case("E14 1e-2", "near fall of a disc, 3e-4 rad from flat", partial(near_fall, 1e-2), 1e-8, 1e-2, NEAR_FLAT),
-    Case("E14 1e-4", "near fall of a disc, 3e-6 rad from flat", partial(near_fall, 1e-4), 1e-3, 1e-2, NEAR_FLAT),
-    unanswered("E14 1e-6", "near fall of a disc, 3e-8 rad from flat", partial(near_fall, 1e-6), "beyond double precision"),
+    Case(
+        "E14 1e-2", "near fall of a disc, 3e-4 rad from flat", partial(near_fall, 1e-2), 1e-8, 1e-2,
+        NEAR_FLAT,
+    ),
+    Case(
+        "E14 1e-4", "near fall of a disc, 3e-6 rad from flat", partial(near_fall, 1e-4), 1e-3, 1e-2,
+        NEAR_FLAT,
+    ),
+    unanswered(
+        "E14 1e-6", "near fall of a disc, 3e-8 rad from flat", partial(near_fall, 1e-6),
+        "beyond double precision",
+    ),
     unanswered("E14 Euler", "Euler's disc: flat in finite time", eulers_disc, "there is no motion beyond"),
     Case("E15", "contact oscillator, 100 s", partial(contact_oscillator, 1, 0.3, 100.0), 1e-8, *LONG_DRIFT),
-    Case("E15 gauge", "the same from a Lagrangian with a gauge term", partial(contact_oscillator, 1, 0.3, 100.0, True), 1e-8, *LONG_DRIFT),
-    Case("E15 chaotic", "chaotic contact oscillator, 100 s", partial(contact_oscillator, 3, 0.3, 100.0), 1e-8, *LONG_DRIFT),
+    Case(
+        "E15 gauge", "the same from a Lagrangian with a gauge term",
+        partial(contact_oscillator, 1, 0.3, 100.0, True), 1e-8, *LONG_DRIFT,
+    ),
+    Case(
+        "E15 chaotic", "chaotic contact oscillator, 100 s", partial(contact_oscillator, 3, 0.3, 100.0), 1e-8,
+        *LONG_DRIFT,
+    ),
     Case("E16", "pendulum-driven transmission, 100 s", gear, 1e-8, *LONG_DRIFT),
     *(
-        Case(f"E17 {k:g}", f"a contact of springs, {k:g} N/m, for rolling", partial(soft_wheel, k), 10 / k, 10 / k + 1e-3, SOFT)
+        Case(
+            f"E17 {k:g}", f"a contact of springs, {k:g} N/m, for rolling", partial(soft_wheel, k), 10 / k,
+            10 / k + 1e-3, SOFT,
+        )
         for k in (1e3, 1e6, 1e8)
     ),
     Case("E19", "a contracting motion run backwards", sleigh_backwards, 1e-8, 2e-1, "errors grow 700 times"),
     required("E21 units", "a rattleback in centimetres", partial(celt_on_edge, 100.0), 1e-9, 1e-2, "as E12"),
-    required("E22 switched", "rows that move: a turntable reverses", switched_turntable, 1e-10, 1e-3, "as E22"),
+    required(
+        "E22 switched", "rows that move: a turntable reverses", switched_turntable, 1e-10, 1e-3, "as E22",
+    ),
 )  # fmt: skip

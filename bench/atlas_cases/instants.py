@@ -65,7 +65,9 @@ def flags_of(found: jj.Accelerations) -> str:
 
 @dataclass
 class DerivativeOfAccelerations:
-    """`d w.udot/d x` at one state, in reverse mode, against a known derivative; `state(x)` gives scene, q, u."""
+    """`d w.udot/d x` at one state, in reverse mode, against a known derivative; `state(x)` gives scene,
+    q, u.
+    """
 
     state: Callable
     x: float

@@ -1,9 +1,10 @@
 """Rolling disc and nonlinear Whipple bicycle as a JAX user would write them: dense matrices by autodiff, one
 linear solve, diffrax, vmap.
 
-    [M A'] [qddot ]   [Q - h ]      M = sum m Jv' Jv + Jw' I Jw,    h = sum m Jv' a0 + Jw' (I alpha0 + omega x I omega)
-    [A 0 ] [lambda] = [-drift]      v = Jv qdot, omega = Jw qdot, rows A qdot = 0;    a0, alpha0, drift: their rates at qddot = 0
+    [M A'] [qddot ]   [Q - h ]      M = sum m Jv' Jv + Jw' I Jw
+    [A 0 ] [lambda] = [-drift]      h = sum m Jv' a0 + Jw' (I alpha0 + omega x I omega)
 
+v = Jv qdot, omega = Jw qdot, A qdot = 0; a0, alpha0, drift: their rates at qddot = 0.
 Poses are written by hand, everything else is differentiated. The state of one lane is the flat array y = (q,
 qdot). Frozen: this file is the mark to beat, so it stays as it is; it imports nothing of the package. Double
 precision is switched on by whoever imports it (`JAX_ENABLE_X64=1`, or `import jourdain_jax` first).

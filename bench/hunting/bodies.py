@@ -140,11 +140,14 @@ def _robot_start(n):
 
 ROBOT = {
     "draw": drawn(
-        mass=(1, 5), inertia=(0.05, 0.4), ahead=one_of(0.0, (-0.1, 0.1)), wheel=(0.1, 1), radius=(0.05, 0.2), half=(0.1, 0.3), heading=(-0.3, 0.3),
+        mass=(1, 5), inertia=(0.05, 0.4), ahead=one_of(0.0, (-0.1, 0.1)), wheel=(0.1, 1), radius=(0.05, 0.2),
+        half=(0.1, 0.3), heading=(-0.3, 0.3),
         v=(-1, 1), heading_rate=either(0.5, 4), tau_left=(-0.02, 0.02), tau_right=(-0.02, 0.02), span=(1, 6),
     ),
-    "truth": _robot_truth, "names": "x y heading left right heading_rate left_rate right_rate", "start": _robot_start, "slack": 3.0,
-    "inputs": lambda n: {"tau_left": n.tau_left, "tau_right": n.tau_right}, "shared": ("span", "tau_left", "tau_right"),
+    "truth": _robot_truth, "names": "x y heading left right heading_rate left_rate right_rate",
+    "start": _robot_start, "slack": 3.0,
+    "inputs": lambda n: {"tau_left": n.tau_left, "tau_right": n.tau_right},
+    "shared": ("span", "tau_left", "tau_right"),
 }  # fmt: skip
 
 
@@ -167,8 +170,12 @@ def _sleigh_truth(n, ts):
 
 
 SLEIGH = {
-    "draw": drawn(mass=(0.5, 2), inertia=(0.2, 1), offset=(-0.3, 0.3), x_rate=(-1, 1), heading_rate=either(0.5, 4), span=(1, 6)),
-    "start": lambda n: {"y_rate": n.offset * n.heading_rate}, "truth": _sleigh_truth, "names": "x y heading heading_rate",
+    "draw": drawn(
+        mass=(0.5, 2), inertia=(0.2, 1), offset=(-0.3, 0.3), x_rate=(-1, 1), heading_rate=either(0.5, 4),
+        span=(1, 6),
+    ),
+    "start": lambda n: {"y_rate": n.offset * n.heading_rate}, "truth": _sleigh_truth,
+    "names": "x y heading heading_rate",
 }  # fmt: skip
 
 
@@ -260,7 +267,9 @@ def _wagon_truth(n, ts):
 
 
 WAGON = {
-    "draw": drawn(size=(0.1, 0.5), rate=(1, 4), length=(0.5, 1.5), angle=(-0.5, 0.5), angle_rate=0.0, span=(1, 5)),
+    "draw": drawn(
+        size=(0.1, 0.5), rate=(1, 4), length=(0.5, 1.5), angle=(-0.5, 0.5), angle_rate=0.0, span=(1, 5),
+    ),
     "truth": _wagon_truth, "names": "angle angle_rate", "cases": 28, "asks": FEW,
 }  # fmt: skip
 SAMPLED = WAGON | {"slack": 100.0, "single": False}
@@ -275,15 +284,24 @@ FAMILIES = (
     _top("free-body", "a free rigid body with a quaternion", 0.0),
     _top("top", "a heavy unsymmetric top with a quaternion", 1.0),
     Family(name="robot", what="differential-drive robots through full headings", scene=Robot, **ROBOT),
-    Family(name="robot-ahead", what="the same with a narrow domain of the heading", scene=RobotAhead, **ROBOT),
-    Family(name="sleigh", what="Chaplygin's sleigh", scene=ChaplyginSleigh, **SLEIGH),
-    Family(name="sleigh-ahead", what="the same with a narrow domain of the heading", scene=SleighAhead, **SLEIGH),
     Family(
-        name="disc", what="rolling discs", scene=TiltingDisc, truth=_disc_truth, names="x y yaw lean spin", slack=3.0,
-        draw=drawn(mass=(0.3, 3), radius=(0.2, 0.8), lean=(-0.4, 0.4), lean_rate=(-0.3, 0.3), yaw_rate=(-1, 1), spin_rate=either(6, 12), span=(0.5, 3)),
+        name="robot-ahead", what="the same with a narrow domain of the heading", scene=RobotAhead, **ROBOT,
+    ),
+    Family(name="sleigh", what="Chaplygin's sleigh", scene=ChaplyginSleigh, **SLEIGH),
+    Family(
+        name="sleigh-ahead", what="the same with a narrow domain of the heading", scene=SleighAhead, **SLEIGH,
     ),
     Family(
-        name="upright-disc", what="an upright disc on circles, saved seldom and often", scene=VerticalDisc, names="x y heading roll", truth=_circles,
+        name="disc", what="rolling discs", scene=TiltingDisc, truth=_disc_truth, names="x y yaw lean spin",
+        slack=3.0,
+        draw=drawn(
+            mass=(0.3, 3), radius=(0.2, 0.8), lean=(-0.4, 0.4), lean_rate=(-0.3, 0.3), yaw_rate=(-1, 1),
+            spin_rate=either(6, 12), span=(0.5, 3),
+        ),
+    ),
+    Family(
+        name="upright-disc", what="an upright disc on circles, saved seldom and often", scene=VerticalDisc,
+        names="x y heading roll", truth=_circles,
         draw=drawn(radius=(0.3, 1), heading_rate=either(0.5, 6), roll_rate=(-5, 5), span=(1, 8)),
     ),
     Family(name="wagon", what="a pendulum on a cart whose place is prescribed", scene=Wagon, **WAGON),

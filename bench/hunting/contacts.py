@@ -258,15 +258,22 @@ WAYS = ("simulate", "jit", "vmap", "rollout")
 WHAT = "a disc with its mass centre off its axle that flies, rolls, slips and strikes"
 FAMILIES = tuple(
     Family(
-        name="friction" if law == "moreau" else f"friction {law}", what=f"{WHAT}; impacts: {law}", scene=type(law, (Eccentric,), {"impact": law}),
+        name="friction" if law == "moreau" else f"friction {law}", what=f"{WHAT}; impacts: {law}",
+        scene=type(law, (Eccentric,), {"impact": law}),
         truth=partial(_truth, law),
         names="x z turn x_rate z_rate turn_rate",
         draw=drawn(
-            radius=(0.2, 0.4), offset=one_of(0.0, (0.0, 0.1)), gyration=(0.1, 0.3), friction=one_of(0.0, (0.05, 1.0), 2.0), bounce=one_of(0.0, (0.0, 0.9), 1.0),
-            push=one_of(0.0, (-6, 6)), torque=one_of(0.0, (-1, 1)), slope=one_of(0.0, (-0.4, 0.4)), x=(-1, 1), z=(0.41, 0.8), turn=(-3, 3), x_rate=either(0, 3),
+            radius=(0.2, 0.4), offset=one_of(0.0, (0.0, 0.1)), gyration=(0.1, 0.3),
+            friction=one_of(0.0, (0.05, 1.0), 2.0), bounce=one_of(0.0, (0.0, 0.9), 1.0),
+            push=one_of(0.0, (-6, 6)), torque=one_of(0.0, (-1, 1)), slope=one_of(0.0, (-0.4, 0.4)), x=(-1, 1),
+            z=(0.41, 0.8), turn=(-3, 3), x_rate=either(0, 3),
             z_rate=(-2, 1), turn_rate=(-10, 10), t0=0.0, span=one_of(0.5, (0.3, 1.5)),
         ),
-        asks=tuple(Ask(WAYS[i % 4], (1, 2, 33)[i % 3], (1e-7, 1e-10)[i // 4 % 2], {"max_transitions": MOST}) for i in range(24)), cases=cases, slack=0.1,
+        asks=tuple(
+            Ask(WAYS[i % 4], (1, 2, 33)[i % 3], (1e-7, 1e-10)[i // 4 % 2], {"max_transitions": MOST})
+            for i in range(24)
+        ),
+        cases=cases, slack=0.1,
     )
     for law, cases in (("moreau", 48), ("newton", 12), ("poisson", 12), ("energetic", 12))
 )  # fmt: skip

@@ -185,14 +185,26 @@ STOP = {
 }  # fmt: skip
 NO_NUMBER = STOP | {"slack": 30.0, "single": False}
 FAMILIES = (
-    Family(name="room", what="several events of a flying particle, the earliest ends it", draw=ROOM_DRAWN, **ROOM, cases=140),
-    Family(name="grazing", what="a ceiling that is passed by a little for a short time", draw=_grazing_drawn, **ROOM),
+    Family(
+        name="room", what="several events of a flying particle, the earliest ends it", draw=ROOM_DRAWN,
+        **ROOM, cases=140,
+    ),
+    Family(
+        name="grazing", what="a ceiling that is passed by a little for a short time", draw=_grazing_drawn,
+        **ROOM,
+    ),
     Family(name="stop", what="an oscillator that meets a stop", scene=Spring, **STOP),
-    Family(name="stop-arcsine", what="an event value that is no number beyond its boundary, 1 - arcsin(x)/(pi/2)", scene=ArcsineStop, **NO_NUMBER),
+    Family(
+        name="stop-arcsine",
+        what="an event value that is no number beyond its boundary, 1 - arcsin(x)/(pi/2)", scene=ArcsineStop,
+        **NO_NUMBER,
+    ),
     Family(name="stop-root", what="the same, sqrt(1 - x)", scene=RootStop, **NO_NUMBER),
     Family(name="stop-logarithm", what="the same, log(1 - x)", scene=LogarithmStop, **NO_NUMBER),
     Family(
-        name="stiff-drop", what="a stiff motion that ends at an event", scene=StiffDrop, truth=_stiff_truth, names="x y y_rate",
-        draw=drawn(k=power(4.5, 7.0), x=0.0, y=(4.0, 9.0), span=one_of(2.0, 5.0)), asks=IMPLICIT, cases=48, fixed=("span", "x", "k"), single=False,
+        name="stiff-drop", what="a stiff motion that ends at an event", scene=StiffDrop, truth=_stiff_truth,
+        names="x y y_rate",
+        draw=drawn(k=power(4.5, 7.0), x=0.0, y=(4.0, 9.0), span=one_of(2.0, 5.0)), asks=IMPLICIT, cases=48,
+        fixed=("span", "x", "k"), single=False,
     ),
 )  # fmt: skip

@@ -86,7 +86,9 @@ def power(low: float, high: float) -> Callable:
 
 
 def drawn(**numbers) -> Callable:
-    """Numbers one after another: between the two of a pair, by a function of the generator, or as they are."""
+    """Numbers one after another: between the two of a pair, by a function of the generator, or as they
+    are.
+    """
     return lambda r: {
         name: float(r.uniform(*x) if isinstance(x, tuple) else x(r) if callable(x) else x)
         for name, x in numbers.items()

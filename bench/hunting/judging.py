@@ -135,7 +135,9 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
 
 
 def _size(family: Family, numbers, truth: Truth, i: int) -> np.ndarray:
-    """What counts as the size of each name: the largest value, or what the family says; at least `size` or 1."""
+    """What counts as the size of each name: the largest value, or what the family says; at least `size`
+    or 1.
+    """
     least = 1.0 if family.size is None else np.array(family.size(SimpleNamespace(**numbers[i])))
     return np.maximum(
         np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0, where=np.isfinite(truth.values[i])), least

@@ -138,26 +138,33 @@ OSCILLATOR = {"scene": Oscillator, "names": "x x_rate", "asks": WAYS}
 FREE = OSCILLATOR | {"truth": pushed_by(lambda n: ([0.0, 1.0], [0.0, 0.0]))}
 FAMILIES = (
     Family(
-        name="hammer", what="an oscillator that `Sampled` strikes for 0.3 to 100 ms", draw=_blow_drawn, single=False,
+        name="hammer", what="an oscillator that `Sampled` strikes for 0.3 to 100 ms", draw=_blow_drawn,
+        single=False,
         **_pushed(_blow, ("when", "length", "force")),
     ),
     Family(
-        name="record", what="an oscillator pushed by forty samples of noise", slack=10.0, **_pushed(_record, ("when", "force")),
+        name="record", what="an oscillator pushed by forty samples of noise", slack=10.0,
+        **_pushed(_record, ("when", "force")),
         draw=drawn(k=(0.2, 4.0), c=(0, 1), x=(0, 1), x_rate=0.0, when=(0, 3), force=(1, 20), span=5.0),
     ),
     Family(
-        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=_far_drawn, cases=72, single=False, fixed=("span", "t0", "k"),
-        size=lambda n: (np.hypot(n.x, n.x_rate / np.sqrt(n.k)), np.hypot(n.x * np.sqrt(n.k), n.x_rate)), **FREE,
+        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=_far_drawn, cases=72,
+        single=False, fixed=("span", "t0", "k"),
+        size=lambda n: (np.hypot(n.x, n.x_rate / np.sqrt(n.k)), np.hypot(n.x * np.sqrt(n.k), n.x_rate)),
+        **FREE,
     ),
     Family(
-        name="far-times-single", what="an oscillator at t0 of 1e3 to 1e5 s, for float32", cases=72, fixed=("span", "t0", "k"),
+        name="far-times-single", what="an oscillator at t0 of 1e3 to 1e5 s, for float32", cases=72,
+        fixed=("span", "t0", "k"),
         draw=drawn(k=(1, 100), x=(0, 1), x_rate=(0, 1), t0=one_of(1e3, 1e4, 1e5), span=(1, 10)), **FREE,
     ),
     Family(
-        name="stiff", what="overdamped oscillators, rates apart by up to 1e12", draw=_stiff_drawn, fixed=("span", "k", "c"), cases=48, single=False, **FREE,
+        name="stiff", what="overdamped oscillators, rates apart by up to 1e12", draw=_stiff_drawn,
+        fixed=("span", "k", "c"), cases=48, single=False, **FREE,
     ),
     Family(
-        name="units", what="masses of 1e-20 to 1e20 kg, lengths of 1e-12 to 1e12 m, 1e-6 to 1e6 rad/s", draw=_units_drawn, single=False, cases=48,
+        name="units", what="masses of 1e-20 to 1e20 kg, lengths of 1e-12 to 1e12 m, 1e-6 to 1e6 rad/s",
+        draw=_units_drawn, single=False, cases=48,
         fixed=("span", "atol"), size=lambda n: (n.x, n.x * np.sqrt(n.k / n.mass)),
         **FREE | {"asks": tuple(ask for ask in WAYS if "rollout" not in ask.way)},
     ),

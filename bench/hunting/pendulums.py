@@ -193,26 +193,40 @@ def _chain_truth(n, ts):
 
 
 FAMILIES = (
-    Family(name="rod-pendulum", what="pendulum in x, z with a rod and a narrow domain", draw=SWING, **ROD, cases=140),
     Family(
-        name="rod-pendulum-in-step", what="the same, saved in step with its rotation", draw=_turning_drawn, times=_full_turns, fixed=("span", "whole"),
+        name="rod-pendulum", what="pendulum in x, z with a rod and a narrow domain", draw=SWING, **ROD,
+        cases=140,
+    ),
+    Family(
+        name="rod-pendulum-in-step", what="the same, saved in step with its rotation", draw=_turning_drawn,
+        times=_full_turns, fixed=("span", "whole"),
         asks=(Ask("simulate", 2), Ask("jit", 8), Ask("vmap", 1, 1e-6), Ask("simulate", 4, 1e-6)), **ROD,
     ),
     Family(
-        name="spherical-pendulum", what="pendulum in x, y, z with a rod and a narrow domain", scene=SphericalPendulum,
-        draw=drawn(length=LENGTH, x_rate=(-8, 8), y_rate=(-8, 8), span=(0.5, 3.0)), start=lambda n: {"z": -n.length, "z_rate": 0.0},
+        name="spherical-pendulum", what="pendulum in x, y, z with a rod and a narrow domain",
+        scene=SphericalPendulum,
+        draw=drawn(length=LENGTH, x_rate=(-8, 8), y_rate=(-8, 8), span=(0.5, 3.0)),
+        start=lambda n: {"z": -n.length, "z_rate": 0.0},
         truth=_spherical_truth, names="x y z x_rate y_rate z_rate",
     ),
-    Family(name="bead-on-ring", what="bead on a ring, an arc for the third coordinate, narrow domain", scene=BeadOnRing, **BEAD),
+    Family(
+        name="bead-on-ring", what="bead on a ring, an arc for the third coordinate, narrow domain",
+        scene=BeadOnRing, **BEAD,
+    ),
     Family(name="bead-on-wide-ring", what="the same, its domain all around", scene=BeadOnWideRing, **BEAD),
     Family(
-        name="blade", what="blade on a slope with a narrow domain of its heading", scene=Blade, truth=_blade_truth,
+        name="blade", what="blade on a slope with a narrow domain of its heading", scene=Blade,
+        truth=_blade_truth,
         draw=drawn(push=(0.0, 4.0), heading=(-0.3, 0.3), v=(-2, 2), heading_rate=(0.5, 6.0), span=(1.0, 6.0)),
-        start=lambda n: {"x_rate": n.v * jnp.cos(n.heading), "y_rate": n.v * jnp.sin(n.heading)}, names="x y heading x_rate y_rate heading_rate",
+        start=lambda n: {"x_rate": n.v * jnp.cos(n.heading), "y_rate": n.v * jnp.sin(n.heading)},
+        names="x y heading x_rate y_rate heading_rate",
     ),
     Family(
-        name="rod-chain", what="double pendulum of rods in x, z with a narrow domain", scene=RodChain, truth=_chain_truth, names="x1 z1 x2 z2", single=False,
+        name="rod-chain", what="double pendulum of rods in x, z with a narrow domain", scene=RodChain,
+        truth=_chain_truth, names="x1 z1 x2 z2", single=False,
         draw=drawn(second=(0.3, 3.0), w1=(-6, 6), w2=(-8, 8), span=(0.5, 1.5)),
-        start=lambda n: {"z1": -1.0, "z2": -2.0, "x1_rate": n.w1, "z1_rate": 0.0, "x2_rate": n.w1 + n.w2, "z2_rate": 0.0},
+        start=lambda n: {
+            "z1": -1.0, "z2": -2.0, "x1_rate": n.w1, "z1_rate": 0.0, "x2_rate": n.w1 + n.w2, "z2_rate": 0.0,
+        },
     ),
 )  # fmt: skip

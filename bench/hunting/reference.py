@@ -54,7 +54,9 @@ def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: f
 
 
 def _step(rates: Callable, t, y, h):
-    """The next state, and its error (cases, 1) relative to what is let pass; zero where a case was given up."""
+    """The next state, and its error (cases, 1) relative to what is let pass; zero where a case was given
+    up.
+    """
     stages: list[np.ndarray] = []
     at = lambda t, y: np.stack([np.broadcast_to(x, t.shape) for x in rates(t, *y)])
     for i in range(table.N_STAGES):

@@ -246,7 +246,8 @@ ARM = """<robot name="arm">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0 0 -0.5"/><mass value="2.0"/>
     <inertia ixx="0.17" iyy="0.17" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <dynamics damping="0.3"/></joint>
 </robot>"""
 FAULTS = (
     ("axis as text", '<axis xyz="0 1 0"/>', "<axis>0 1 0</axis>"),
@@ -361,7 +362,8 @@ TWO_MOTIONS = """
 import json, warnings; warnings.simplefilter("ignore")
 import jourdain_jax as jj
 scenes = jj.models.VerticalDisc(), jj.models.ChaplyginSleigh()
-print(json.dumps([jj.simulate(scene, jj.start(scene, heading_rate=0.7), t1=1.0).q_end.tolist() for scene in scenes]))
+motions = [jj.simulate(scene, jj.start(scene, heading_rate=0.7), t1=1.0) for scene in scenes]
+print(json.dumps([motion.q_end.tolist() for motion in motions]))
 """
 
 
@@ -388,7 +390,8 @@ def _cache_file(seed: int):
             old = contents[k]
             at = int(r.integers(len(old)))
             changed = {
-                "exchanged": contents[(k + 1) % len(files)], "torn": old[:at], "other bytes": old[:32] + r.bytes(len(old) - 32),
+                "exchanged": contents[(k + 1) % len(files)], "torn": old[:at],
+                "other bytes": old[:32] + r.bytes(len(old) - 32),
                 "one bit": old[:at] + bytes([old[at] ^ (1 << int(r.integers(8)))]) + old[at + 1 :],
             }  # fmt: skip
             file.write_bytes(changed[how])

@@ -15,7 +15,9 @@ from hunting.pendulums import Weighted
 
 
 class Strip(OnLine):
-    """A mass that slides freely along x, and is braked by `force` N on a strip from `at` to `at + width` m."""
+    """A mass that slides freely along x, and is braked by `force` N on a strip from `at` to `at + width`
+    m.
+    """
 
     force: object = jj.parameter(1.0)
     at: object = jj.parameter(1.0)
@@ -186,8 +188,10 @@ class SwingSpeed(TurnedSpeed):
 def _turned(name, scene, weight, weight_of_start, first):
     """q = q0 + r t; it passes the place where the rate of the coordinate is infinite."""
     return Family(
-        name=name, what="a quasi-velocity whose coordinate rate is infinite at one place", scene=scene, names="q w", cases=40,
-        truth=lambda n, ts: (n.q + n.rate * ts, weight(n.q + n.rate * ts) * n.rate), start=lambda n: {"w": weight_of_start(n.q) * n.rate},
+        name=name, what="a quasi-velocity whose coordinate rate is infinite at one place", scene=scene,
+        names="q w", cases=40,
+        truth=lambda n, ts: (n.q + n.rate * ts, weight(n.q + n.rate * ts) * n.rate),
+        start=lambda n: {"w": weight_of_start(n.q) * n.rate},
         draw=drawn(q=first, rate=lambda r: -r.uniform(0.5, 2.0), span=(0.3, 3.0)),
     )  # fmt: skip
 
@@ -249,20 +253,32 @@ def _set_pace_truth(n, ts):
 ASKS = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap", 3), Ask("simulate", 9, 1e-6))
 LINE, ROWS = {"names": "x x_rate", "cases": 63}, {"cases": 42, "single": False, "asks": ASKS}
 FAMILIES = (
-    Family("strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, **LINE),
+    Family(
+        "strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, **LINE,
+    ),
     Family("pulse", "a force for 0.6 to 12 % of the span", Pulse, _pulse_drawn, _pulse_truth, **LINE),
-    Family("bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth, **LINE | {"cases": 42, "single": False}),
-    Family("window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth, **LINE),
+    Family(
+        "bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth,
+        **LINE | {"cases": 42, "single": False},
+    ),
+    Family(
+        "window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth,
+        **LINE,
+    ),
     Family("gate", "the same by `where`", Gate, _window_drawn, _window_truth, **LINE | {"cases": 42}),
     _turned("turned-speed", TurnedSpeed, np.sin, jnp.sin, (0.4, 1.5)),
     _turned("swing-speed", SwingSpeed, np.cos, jnp.cos, (-1.0, 1.0)),
     Family(
-        name="even-pace", what="Appell and Hamel's constraint up to the top of the throw, and beyond", scene=EvenPace, draw=_pace_drawn, truth=_pace_truth,
+        name="even-pace", what="Appell and Hamel's constraint up to the top of the throw, and beyond",
+        scene=EvenPace, draw=_pace_drawn, truth=_pace_truth,
         names="x y z x_rate y_rate z_rate", **ROWS,
-        start=lambda n: {"x_rate": n.v * jnp.cos(n.turn), "y_rate": n.v * jnp.sin(n.turn), "z_rate": n.slope * n.v},
+        start=lambda n: {
+            "x_rate": n.v * jnp.cos(n.turn), "y_rate": n.v * jnp.sin(n.turn), "z_rate": n.slope * n.v,
+        },
     ),
     Family(
-        name="set-pace", what="a prescribed magnitude of the velocity that passes zero", scene=SetPace, truth=_set_pace_truth, names="x y x_rate y_rate",
+        name="set-pace", what="a prescribed magnitude of the velocity that passes zero", scene=SetPace,
+        truth=_set_pace_truth, names="x y x_rate y_rate",
         draw=drawn(pace=(0.5, 3.0), turn=(0.0, 6.0), span=(1.0, 4.5)), **ROWS,
         start=lambda n: {"x_rate": n.pace * jnp.cos(n.turn), "y_rate": n.pace * jnp.sin(n.turn)},
     ),

@@ -1,4 +1,6 @@
-"""Events after which motions go on, with modes and jumps, against SciPy's steps from one event to the next."""
+"""Events after which motions go on, with modes and jumps, against SciPy's steps from one event to the
+next.
+"""
 
 import diffrax
 import jax.numpy as jnp
@@ -108,17 +110,27 @@ def _truth(n, ts):
 
 WAYS = ("simulate", "jit", "vmap", "rollout")
 HOW = (
-    {"backend": "native"}, {"backend": "xla"}, {"solver": jj.Taylor()}, {"solver": jj.RadauIIA()}, {"solver": diffrax.Tsit5()}, {"backend": "dense"},
+    {"backend": "native"}, {"backend": "xla"}, {"solver": jj.Taylor()}, {"solver": jj.RadauIIA()},
+    {"solver": diffrax.Tsit5()}, {"backend": "dense"},
     {"formulation": jj.Formulation("full")},
 )  # fmt: skip
 FAMILIES = (
     Family(
-        name="transitions", what="motions that go on after events, with modes and jumps", scene=Switched, truth=_truth, names="x y x_rate y_rate",
+        name="transitions", what="motions that go on after events, with modes and jumps", scene=Switched,
+        truth=_truth, names="x y x_rate y_rate",
         draw=drawn(
-            stiff=(3, 12), soft=(0.5, 3), cube=(0, 1), a=either(0.3, 1), b=(-0.5, 0.5), limit=one_of(0.3, (-0.1, 0.8)), kept=(0.3, 1), moved=(-0.1, 0.1),
-            x=(-0.5, 0.5), y=(-0.5, 0.5), x_rate=either(0.5, 3), y_rate=(-2, 2), t0=one_of(0.0, 0.7), span=one_of(3.0, (1, 5), (-3, -1)),
+            stiff=(3, 12), soft=(0.5, 3), cube=(0, 1), a=either(0.3, 1), b=(-0.5, 0.5),
+            limit=one_of(0.3, (-0.1, 0.8)), kept=(0.3, 1), moved=(-0.1, 0.1),
+            x=(-0.5, 0.5), y=(-0.5, 0.5), x_rate=either(0.5, 3), y_rate=(-2, 2), t0=one_of(0.0, 0.7),
+            span=one_of(3.0, (1, 5), (-3, -1)),
         ),
-        asks=tuple(Ask(WAYS[i % 4], (1, 2, 33)[i % 3], (1e-6, 1e-9)[i // 7 % 2], HOW[i % 7] | {"max_transitions": MOST}) for i in range(28)),
+        asks=tuple(
+            Ask(
+                WAYS[i % 4], (1, 2, 33)[i % 3], (1e-6, 1e-9)[i // 7 % 2],
+                HOW[i % 7] | {"max_transitions": MOST},
+            )
+            for i in range(28)
+        ),
         cases=56, slack=0.1,
     ),
 )  # fmt: skip

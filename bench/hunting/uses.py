@@ -186,8 +186,10 @@ class ElsewhereRow(LateRow):
 
 
 LATE = {
-    "truth": lambda n, ts: (ts, n.speed * ts, 1.0, n.speed), "names": "x y x_rate y_rate", "cases": 28, "slack": 100.0, "single": False,
-    "draw": drawn(late=(5.0, 8.0), speed=(-0.5, 0.5), span=10.0), "start": lambda n: {"x_rate": 1.0, "y_rate": n.speed},
+    "truth": lambda n, ts: (ts, n.speed * ts, 1.0, n.speed), "names": "x y x_rate y_rate", "cases": 28,
+    "slack": 100.0, "single": False,
+    "draw": drawn(late=(5.0, 8.0), speed=(-0.5, 0.5), span=10.0),
+    "start": lambda n: {"x_rate": 1.0, "y_rate": n.speed},
     "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("jit rollout")),
 }  # fmt: skip
 
@@ -230,15 +232,21 @@ ALONE = {
 }
 FAMILIES = (
     Single("times", "times before the start, against the span or beyond it", _times, 32),
-    Single("changed", "what methods read besides their arguments: numbers and functions that change between calls, and objects with state", _changed, 36),
+    Single(
+        "changed",
+        "names that methods read: numbers and functions that change between calls, and objects with state",
+        _changed, 36,
+    ),
     Family(name="late-row", what="a row that sets in after some seconds", scene=LateRow, **LATE),
     Family(name="row-elsewhere", what="a row that sets in beyond a place", scene=ElsewhereRow, **LATE),
     Family(
-        name="tiny-force", what="a force of 1e-24 exp(x/0.1)", scene=TinyForce, truth=_pushed(lambda x: -1e-24 * np.exp(x / 0.1)), fixed=("span",),
+        name="tiny-force", what="a force of 1e-24 exp(x/0.1)", scene=TinyForce,
+        truth=_pushed(lambda x: -1e-24 * np.exp(x / 0.1)), fixed=("span",),
         draw=drawn(x=(5.0, 5.6), x_rate=(-0.3, 0.3), span=1.0), **ALONE,
     ),
     Family(
-        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce, truth=_pushed(lambda x: -G * np.sin(x)),
+        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce,
+        truth=_pushed(lambda x: -G * np.sin(x)),
         draw=drawn(x=(-2.0, 2.0), x_rate=(-3, 3), span=(0.5, 2)), **ALONE,
     ),
 )  # fmt: skip

@@ -156,6 +156,8 @@ def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Itera
                     " ms per trajectory"
                 )
                 yield records.record(
-                    problem=problem.name, method=method, kind=kind, setting=tolerance, setting_unit="tolerance", batch=size, error=error, seconds=each,
-                    note=f"starts scattered by 5 %; largest error over {min(size, JUDGED)} lanes", versions=records.versions(*packages),
+                    problem=problem.name, method=method, kind=kind, setting=tolerance,
+                    setting_unit="tolerance", batch=size, error=error, seconds=each,
+                    note=f"starts scattered by 5 %; largest error over {min(size, JUDGED)} lanes",
+                    versions=records.versions(*packages),
                 )  # fmt: skip

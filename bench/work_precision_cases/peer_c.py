@@ -61,7 +61,8 @@ long solve(double tolerance, double end, long lanes, const double *start, double
         for (int l = 0; l < W; l++) {
             double size = 0, speed = 0;
             for (int i = 0; i < N; i++) {
-                const double scale = tolerance * (1 + fabs(y[i * W + l])), a = y[i * W + l] / scale, b = k[0][i * W + l] / scale;
+                const double scale = tolerance * (1 + fabs(y[i * W + l]));
+                const double a = y[i * W + l] / scale, b = k[0][i * W + l] / scale;
                 size += a * a, speed += b * b;
             }
             h[l] = fmin(end, speed > 0 ? 0.01 * sqrt(size / speed) + 1e-6 : 1e-3);
@@ -77,7 +78,8 @@ long solve(double tolerance, double end, long lanes, const double *start, double
                 }
                 EACH_LANE {
                     next[i * W + l] = y[i * W + l] + h[l] * change[l];
-                    const double e = h[l] * error[l] / (tolerance * (1 + fmax(fabs(y[i * W + l]), fabs(next[i * W + l]))));
+                    const double most = fmax(fabs(y[i * W + l]), fabs(next[i * W + l]));
+                    const double e = h[l] * error[l] / (tolerance * (1 + most));
                     squares[l] += e * e;
                 }
             }

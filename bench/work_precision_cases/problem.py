@@ -69,7 +69,9 @@ class Problem:
 
     @functools.cached_property
     def completed(self) -> Callable:
-        """A function of coordinates and privileged speeds at the end that returns coordinates and all speeds."""
+        """A function of coordinates and privileged speeds at the end that returns coordinates and all
+        speeds.
+        """
         scene, n, end = self.scene, len(self.scene.coordinate_names.entries), jnp.asarray(self.end)
         rows = jj.structure_of(scene).kept_rows
         return jax.jit(
