@@ -190,7 +190,7 @@ def test_guards_and_smooth_functions_do_not_count():
 
 def test_what_is_not_watched_is_said():
     many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
-    assert "not monitored: they are 40, more than 32" in str(motion(many))
+    assert "not monitored: there are 40, more than 32" in str(motion(many))
     hidden = motion(Sliding(law=lambda s, t, x, v: jnp.interp(x, jnp.array([0.6, 0.7, 0.8]), jnp.eye(3)[1])))
     assert "not monitored: the scene keeps parts as calls" in str(hidden)
     assert hidden.crossings == -1

@@ -27,8 +27,8 @@ from jourdain_jax.structure.structure import plain_row_lengths, usual_rows
 
 
 def along(f: Callable, arguments, point, direction, u) -> tuple:
-    """Return the value and derivative of `f(arguments, point)` along a direction, its values at -2h, -h, h
-    and 2h, and the increment h, which depends on the speeds `u`.
+    """Return, along a direction, the value and derivative of `f(arguments, point)`, its values at -2h, -h, h
+    and 2h, and h. The increment h depends on the speeds `u`.
     """
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
     ends = [

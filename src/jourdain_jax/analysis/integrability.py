@@ -149,9 +149,9 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
 
 
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
-    """Return the growth vector of the admissible velocities at generic states, from brackets of at most
-    `depth` fields, and whether it is closed (longer brackets add nothing, or all dimensions are reached). It
-    is empty for constraints nonlinear in the speeds.
+    """Return the growth vector of the admissible velocities at generic states, and whether it is closed.
+    Brackets have at most `depth` fields. The vector is closed if longer brackets add nothing or all
+    dimensions are reached, and empty for constraints nonlinear in the speeds.
 
     The larger of the results at two random states counts. A bracket is a new direction if its new part
     exceeds 1e-6 (1e-2 in single precision) of its terms.

@@ -184,7 +184,7 @@ def linearize(
     - `state`: on the constraints. If it is not steady, A, B and M, C, K hold only at this instant, and
       `residual` measures the deviation. They are constant along a steady motion in which only ignorable
       coordinates move, such as a disc's yaw and spin.
-    - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A
+    - `coordinates`: names for the second-order form; default: all coordinates with a privileged rate. A
       quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body axes.
     - `inputs`: values of the scene's inputs (default: zero), held constant.
     - `dependent`: names of the coordinates determined by the geometric constraints; `privileged`: names of

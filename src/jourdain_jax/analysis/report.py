@@ -139,8 +139,8 @@ class Report(Printed):
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):
             return (
-                f"{len(self.rows) - self.rank} at each configuration, but none at all of them: which rows"
-                " follow from the others changes along the motion"
+                f"{len(self.rows) - self.rank} at each configuration, but not the same everywhere: none"
+                " may be omitted"
             )
         return "none"
 
@@ -150,8 +150,8 @@ class Report(Printed):
         freedoms = len(self.speeds) - (self.rank_at_start or 0)
         return (
             f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} "
-            "freedoms: a singular configuration, or another way to assemble the scene; state a `domain` "
-            "around the start to have it judged there"
+            "freedoms: a singular configuration, or another way to assemble the scene; a `domain` "
+            "around the start shows which"
         )
 
     def _growth(self) -> str:

@@ -104,8 +104,8 @@ def steady(
     - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It may violate the constraints.
     - `held`: names of coordinates and speeds that keep the guess's value; all others are unknown. If many
       steady motions have these values, the result is one near the guess.
-    - `moving`: names of the coordinates that may change; default: those without influence on the scene's
-      accelerations (`ignorable`).
+    - `moving`: names of the coordinates that may change; default: coordinates without influence on the
+      scene's accelerations (`ignorable`).
     - `inputs`: values of the scene's inputs (default: zero).
     - `privileged`: names of the speeds that must be constant (default: the scene's own). Choose speeds in
       which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.

@@ -32,14 +32,14 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     - `ignore`: names of elements and attributes to omit although they change the motion, such as "armature"
       or "equality". With "inertia", impossible moments of inertia are accepted.
 
-    **Returns** a class. Hinges and slides are coordinates with their names, a ball joint is a quaternion with
-    its name, and a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints
-    without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo.
-    Motors of joints and of sites are inputs; as in MuJoCo, `ctrlrange` limits the input and `forcerange` its
-    force. Nonzero values of the file are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's
-    frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`, `<joint>_stiffness` and
-    `gravity` (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms come from their mass or
-    density. The pose of the file is the `example`.
+    **Returns** a class. Hinges and slides are coordinates with their names. A ball joint is a quaternion with
+    its name; a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints without a
+    name are called `<body>_joint`, with a number from the second on. Speeds are defined as in MuJoCo. Motors
+    of joints and of sites are inputs; as in MuJoCo, `ctrlrange` limits the input and `forcerange` its force.
+    Nonzero values of the file are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame),
+    `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`, `<joint>_stiffness` and `gravity`
+    (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms come from their mass or density.
+    The pose of the file is the `example`.
 
     `connect`, `weld` and `joint` of `equality` become exact geometric constraints: loops are closed as in the
     stated pose.

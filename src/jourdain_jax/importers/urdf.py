@@ -117,11 +117,11 @@ def from_urdf(
     of a subclass.
 
     **Raises** ValueError, with the name of the link or joint, for an unreadable file, an unknown type of
-    joint, a parent or child that does not exist, a loop, a mass without inertia, impossible moments of
-    inertia (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a joint
-    with friction, and repeated statements. Contents that do not belong to a URDF also raise it, with their
-    name: a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A warning
-    lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.
+    joint, a parent or child that does not exist, a loop, and repeated statements; also for a mass without
+    inertia, impossible moments of inertia (the largest above the sum of the others by more than 5 %), a joint
+    that moves no mass, and a joint with friction. Contents that do not belong to a URDF also raise it, with
+    their name: a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A
+    warning lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:

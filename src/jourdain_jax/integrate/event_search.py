@@ -292,7 +292,7 @@ def put_tangents(
     w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number
 ) -> None:
     """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each tangent
-    of time shifts the state along its directions e. Values and rates are those before the event; without
+    of time shifts the state along its directions e. Values and rates are taken before the event; without
     slope the tangents are NaN.
 
         dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0"""

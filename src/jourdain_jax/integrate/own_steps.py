@@ -277,7 +277,7 @@ def _reason_against_sides(setup: Setup) -> str:
     ]
     if set(sampled) & set(program.graph.reachable(numbers)):
         return "one depends on samples"
-    return f"they are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
+    return f"there are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:

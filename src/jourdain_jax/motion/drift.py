@@ -42,8 +42,8 @@ MOST_STEP_ERRORS = 10  # times the change from N steps at their tolerance
 def conserves(setup: Setup) -> bool:
     """Return whether T + V is constant along a motion with step-size control.
 
-    False if work is integrated, because it may be a small difference of large powers whose errors
-    step-size control does not bound.
+    False if work is integrated: it may be a small difference of large powers, so step-size control does not
+    bound its error.
     """
     return (
         setup.field.conserves

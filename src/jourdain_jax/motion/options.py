@@ -43,7 +43,8 @@ class Options:
     - `max_steps`: maximum number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so that
       brief loads and dips of events are not missed; inf: no limit.
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
-      motion, but not those at which it continues. `work`: integrate the work of loads without a potential.
+      motion; events at which it continues stay active. `work`: integrate the work of loads without a
+      potential.
     - `max_transitions`: maximum number of events at which a motion continues (`jj.Event`).
     - `retry`: repeat a failed motion with the full state if its independent speeds became invalid, or by an
       implicit solver if it is stiff and no `solver` is given. `trajectory.fallback` and the summary report a

@@ -6,9 +6,8 @@
 Retries add up, and each is made once: a stiff motion with invalid independent speeds runs with the
 full state by Radau's method.
 
-With an explicit method, a mode exp(-r t) limits the step h to a small number h r (about 3 for Tsit5, 6
-for Dopri8), however small the mode is. A motion that ran out of steps near that limit is stiff; the
-criterion here is `h r >= 1`.
+A mode exp(-r t), however small, limits the step h of an explicit method: h r is at most about 3 for Tsit5, 6
+for Dopri8. A motion that ran out of steps near that limit is stiff; the criterion here is `h r >= 1`.
 """
 
 from collections.abc import Callable

@@ -8,8 +8,8 @@ start. With the error s = atol + rtol |y| that step-size control allows at one s
     relative error of a derivative <~ steps amplification rtol
 
 because every step adds an error s, and the derivative is evaluated along a path that is off by the sum of
-these errors. In forward mode, let d_0, d_m and d_1 be the tangents of the start, of the middle saved state
-and of the end, and s the error for the largest |y| of each number:
+these errors. In forward mode, d_0, d_m and d_1 are the tangents of the start, of the middle saved state and
+of the end; s is the error for the largest |y| of each number:
 
     amplification = max |d_1|/s / max |d_0|/s              if only the start varies
                     (max |d_1|/s / max |d_m|/s)^2          otherwise; the smaller of both if the start varies

@@ -82,7 +82,9 @@ def stability_chart(
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
     known, place, given = middle.equations, numbered(scene), dict(prior or {})
     assert isinstance(known, SteadyEquations)
-    check_names(given, vars(place), f"`prior` names `{{}}`, no parameter of `{type(scene).__name__}`")
+    check_names(
+        given, vars(place), f"`prior` names `{{}}`, which is not a parameter of `{type(scene).__name__}`"
+    )
     sigma, k = np.zeros(len(known.given)), known.index(second)
     try:
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]

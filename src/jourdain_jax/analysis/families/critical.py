@@ -218,7 +218,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     **Arguments**
 
     - `scene`: of the same class as the family's scene. Its parameters may be traced, and may differ from the
-      family's: the point is followed from those parameters to these.
+      family's: the point is followed from the family's parameters to the given ones.
     - `motions`: the family, with its inputs.
     - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. Of several such
       points, the one nearest to the family's guess is taken.

@@ -130,7 +130,7 @@ def _left(equations: Motions, point: Point) -> str | None:
             or (declared["non_negative"] and values[name] < -1e-12)
         ):
             return (
-                f"`{name}` is declared {'positive' if declared['positive'] else 'non-negative'}, and is"
+                f"`{name}` is declared {'positive' if declared['positive'] else 'non-negative'}, but would be"
                 f" {values[name]:.3g} at the next point"
             )
     return None

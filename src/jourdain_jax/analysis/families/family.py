@@ -233,8 +233,8 @@ def family(
 
     **Arguments**
 
-    - `guess`: as in `steady`; or a branch point of another family of steady motions, whose other curve is
-      followed; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
+    - `guess`: as in `steady`; or a branch point of another family of steady motions, to follow the other
+      curve through it; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
       quantities of its search.
     - `until`: name -> value at which the curve ends. The curve starts at the guess, keeps the guess's value
       of that name there, and is followed towards the given value; without `until` it is followed in both
@@ -247,10 +247,10 @@ def family(
       1", ...
     - `max_points`: the largest number of points in each direction.
 
-    **Returns** a `Family`, traced by pseudo-arclength, with special points accurate to round-off. Steps are
-    at most 0.1 of the sizes of the unknowns (for a coordinate the width of its domain, for a speed 10 SI
-    units) and turn by at most 10 degrees. Two special points of one kind within one step are found only if
-    the test function between them is nearly a parabola, as for points 1 mm apart on a curve of 1 m.
+    **Returns** a `Family`, traced by pseudo-arclength, with special points accurate to round-off. Steps turn
+    by at most 10 degrees and are at most 0.1 of the sizes of the unknowns. The size of a coordinate is the
+    width of its domain, the size of a speed 10 SI units. Two special points of one kind within one step are
+    found only if the test function is nearly a parabola between them, as 1 mm apart on a curve of 1 m.
 
     **Raises** ValueError for an unknown name; if no steady motion is near the guess; for none or several
     freedoms (the error names quantities to hold); and for a start at a branch point. Raises `NotLowered` if

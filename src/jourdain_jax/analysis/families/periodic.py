@@ -154,10 +154,7 @@ def periodic(
     built, scene = scene, as_scene(scene)
     inputs = as_inputs(scene, by_name.pop("inputs", None))
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
-    beside = (
-        "it finds a motion whose length is `period`, which no stop event ends, by runs without work and"
-        " retries"
-    )
+    beside = "it integrates one `period`, passes stop events, and needs neither work nor retries"
     options = as_options(
         options,
         {**tolerances, **by_name},

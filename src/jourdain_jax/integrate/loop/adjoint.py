@@ -1,9 +1,9 @@
 """Reverse mode of the loop over steps: cotangents of the start from the cotangents of the states and the end.
 
 All lanes of a block begin and end together here. On the forward pass every trial step leaves a slot
-(`record.py`): the state before it, the slopes of its stages, the advance of the state (zero if the
-step was rejected or the lane had ended), and the number of times saved before it. On the backward
-pass, with a fixed step size,
+(`record.py`): the state before the step, the slopes of its stages, its length, and the number of times saved
+before. The length is zero if the step was rejected or the lane had ended. On the backward pass, with a fixed
+step size,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l
     (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum_i G_i
@@ -261,8 +261,8 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable:
-    """Return a function of samples, the rows of a start, cotangents of the states at the goals and of the end
-    (with its time last), and the goals.
+    """Return reverse mode as a function of samples, of the rows of a start, of cotangents of the states at
+    the goals and of the end, with its time last, and of the goals.
 
     It returns cotangents of the initial state, and of the requested numbers among the known ones (`asked`). A
     state is followed by its tangent.

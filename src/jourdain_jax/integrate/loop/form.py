@@ -3,17 +3,17 @@
 A sample enters with the rows of `Form.given`, which include its initial progress, and leaves with the rows of
 its final progress. Tangents of the state follow the state, tangents of the rates' known numbers follow these
 numbers; `dt` are tangents of time, which only an event's time has. Derivatives of order n in directions e_1
-to e_n have 2^n - 1 tangents, indexed by the binary numbers of their subsets of directions: for second order
-those along e_1, e_2, and both. `taken` is the advance by the last step. For Taylor series, `before` is the
-start time of the step, and `bound` limits the next one after a rejection.
+to e_n have 2^n - 1 tangents, indexed by the binary numbers of their subsets of directions: for second order,
+tangents along e_1, along e_2, and along both. `taken` is the advance by the last step. For Taylor series,
+`before` is the start time of the step, and `bound` limits the next one after a rejection.
 
-For sampled inputs, rows of pointers and integers locate a lane's samples (`table`), their number per input
-(`samples`), and the next knot, at which a step must end (`knot`; `samples.py`).
+For sampled inputs (`samples.py`), `table` points to a lane's samples, `samples` is their number per input,
+and `knot` points to the next knot, at which a step must end.
 
-If the motion continues after events (`transitions.py`), `mode` are the modes, `passed` counts the
-transitions, and `log_event`, `log_mode`, `log_lost` and `log_t` record for each the event, the new modes,
-the loss of energy, and the time with its tangents. `begun` is the number of steps accepted up to the last
-transition, `disarmed` marks events whose value has not yet left zero. `left` describes the transition in
+If the motion continues after events (`transitions.py`), `mode` are the modes, and `passed` counts the
+transitions. `log_event`, `log_mode`, `log_lost` and `log_t` record, for each transition, the event, the new
+modes, the loss of energy, and the time with its tangents. `begun` is the number of steps accepted up to the
+last transition, `disarmed` marks events whose value has not yet left zero. `left` describes the transition in
 the last trial step: the event's index plus 1 (negative if its value has no slope), or 0 for none; its time;
 the state and modes before it.
 """

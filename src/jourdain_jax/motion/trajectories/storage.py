@@ -10,11 +10,11 @@ numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `unwatched`
 (names of all arrays), `versions`, `digest` (SHA-256 of the rest of the header and of all arrays; files of
 earlier versions have none).
 
-`kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis (so `result` is one
-code per sample), and `reruns` in its header describes how samples with a `fallback` were repeated.
+`kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis: `result` is one code
+per sample. `reruns` in its header describes how samples with a `fallback` were repeated.
 
-Loading raises an error if the digest does not match, because the file is damaged or was changed, or if the
-scene's class has changed its parameters, their units, or its names.
+Loading raises an error if the digest does not match: the file is damaged or was changed. It also raises an
+error if the scene's class has changed its parameters, their units, or its names.
 """
 
 import hashlib
