@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_stiff import Following
 
 import jourdain_jax as jj
-from jourdain_jax.integrate.loop import loop as kernels
+from jourdain_jax.integrate.loop import loop_function as kernels
 from jourdain_jax.kernels import ffi, host
 from jourdain_jax.motion.simulate import set_up
 

@@ -185,7 +185,7 @@ class Begun(eqx.Module):
     start: State
     args: tuple  # vector field, scene, inputs, the scene's fixed values, origin of time
     y0: Integrated
-    plain: Plain | None = None  # for GPU kernels, which receive shared numbers once
+    plain: Plain | None = None  # for machine code, which receives shared numbers once
 
 
 def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":

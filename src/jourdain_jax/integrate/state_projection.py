@@ -149,7 +149,7 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
     left = jnp.concatenate([g, phi])
     right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
     moved_q, moved_u, residual = (
-        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left)
+        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, jax.lax.stop_gradient(left))
     )
     names = scene.coordinate_names, scene.speed_names
     moved = moved_q, moved_u, jnp.where(right, residual, jnp.inf)

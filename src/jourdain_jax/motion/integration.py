@@ -51,7 +51,7 @@ def _one_motion(setup: Setup) -> Trajectory:
     given = _in_contact(_with_machine_code(_prepared(setup)))
     setup, asked = _entered(given)
     begun, fitting = _begin(setup), setup.fitting()
-    if jax.default_backend() != "cpu" and not setup.reason_against_machine_code:
+    if not setup.reason_against_machine_code:
         begun = replace(begun, plain=_plain(given))
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
@@ -282,20 +282,23 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
 
 
 def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
-    """Return the result code, with the cause if known; later conditions take precedence."""
+    """Return the result code, with the cause if known; earlier conditions take precedence."""
     start, end = begun.start, solved.y_end
     eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
-    code = jnp.where(finite(end.q, end.v), code, result_codes.NOT_FINITE)
-    # a pivot that changed sign or is this small means that independent speeds no longer determine the others
-    code = jnp.where(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION, code)
-    code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, result_codes.INCONSISTENT_START)
-    code = jnp.where(
-        (code == result_codes.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED, code
+    short = code == result_codes.STEP_TOO_SMALL
+    causes = (
+        (~begun.right, result_codes.BAD_PARAMETER),
+        (~jnp.asarray(begun.timely), result_codes.BAD_TIMES),
+        (~finite(start.q, start.u), result_codes.BAD_START),
+        (~(start.residual <= 1e3 * jnp.sqrt(eps)), result_codes.INCONSISTENT_START),
+        # a pivot that changed sign or is this small: independent speeds no longer determine the others
+        (jnp.asarray(pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION),
+        (~finite(end.q, end.v), result_codes.NOT_FINITE),
+        (short & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED),
+        # if no step succeeds, however short, the accelerations themselves are at fault
+        (short & (solved.accepted == 0), result_codes.NOT_FINITE),
     )
-    # if no step succeeds, however short, the accelerations themselves are at fault
-    code = jnp.where(
-        (code == result_codes.STEP_TOO_SMALL) & (solved.accepted == 0), result_codes.NOT_FINITE, code
-    )
-    code = jnp.where(finite(start.q, start.u), code, result_codes.BAD_START)
-    code = jnp.where(begun.timely, code, result_codes.BAD_TIMES)
-    return jnp.where(begun.right, code, result_codes.BAD_PARAMETER).astype(jnp.int32)
+    # XLA repeats a chain of `where` in each derivative that is NaN after a failure, but not a reduction
+    noted = jnp.stack([is_so for is_so, _ in causes])
+    first = jnp.min(jnp.where(noted, jnp.arange(len(causes)), len(causes)))
+    return jnp.append(jnp.array([cause for _, cause in causes], jnp.int32), code.astype(jnp.int32))[first]

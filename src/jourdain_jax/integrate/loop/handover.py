@@ -35,7 +35,7 @@ class Start(NamedTuple):
     # numbers; for a loop in JAX, the stored arguments of rates, batch axis first
     known: tuple[tuple[Array, ...], ...]
     modes: Numbers = ()
-    plain: tuple[Array, ...] = ()  # `known` without batch axis where shared, for GPU kernels
+    plain: tuple[Array, ...] = ()  # `known` without batch axis where shared
 
     def numbers(self) -> Numbers:
         """Return the rows at the start after the state, except `constant_rows`. Rows shared by
