@@ -1,14 +1,14 @@
 """Holonomic constraints: single constraints by Frobenius' criterion, all together by the growth of the
 admissible velocities.
 
-A row `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 = d -
-alpha . nu`. It is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the
+A constraint `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 =
+d - alpha . nu`. It is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the
 velocities that w admits (Frobenius).
 
-All rows: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1,
-D_k]` grow to a final dimension; the motion stays on a manifold of that dimension. If constraints or rates
-depend on time or are not homogeneous, time counts as an additional coordinate with the field `(1, X_0)`; its
-dimension is omitted from the growth vector.
+All constraints together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1
+= D_k + [D_1, D_k]` grow to a final dimension; the motion stays on a manifold of that dimension. If
+constraints or rates depend on time or are not homogeneous, time counts as an additional coordinate with the
+field `(1, X_0)`; its dimension is omitted from the growth vector.
 
 `[X, Y] = DY X - DX Y` along the fields. Brackets of brackets need derivatives of derivatives, taken by
 central differences of eighth order (to about 1e-11): every further exact derivative would double the cost.
@@ -100,17 +100,16 @@ STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit direc
 
 
 def integrable_below() -> float:
-    """Return the violation of Frobenius' criterion below which a row counts as integrable."""
+    """Return the violation of Frobenius' criterion below which a constraint counts as integrable."""
     return 1e-9 if real_type() == jnp.float64 else 1e-4
 
 
 def frobenius_violations(scene: Scene) -> dict[str, float]:
-    """Return Frobenius' criterion for every single row, at six random admissible states of the scene's
-    domain.
+    """Return Frobenius' criterion for every single constraint, at six random admissible states of the domain.
 
     The criterion is the largest value of the two-form dw on unit velocities that w admits, over all states,
-    divided by the size of w and of its derivatives. It is infinite for rows nonlinear in the speeds, which
-    are no differential forms.
+    divided by the size of w and of its derivatives. It is infinite for constraints nonlinear in the speeds,
+    which are no differential forms.
     """
     names = structure_of(scene).row_names
     if not names:

@@ -79,8 +79,9 @@ def verify(
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
     Values are relative to the size of the compared quantities. Thresholds depend on the floating-point type
-    (`analysis.statements`): single precision shows only gross errors and certifies nothing. If no reduction
-    applies (no inertia along a free direction), there are no gradients to check, and the verification fails.
+    (`analysis/verification.py`): single precision shows only gross errors, so passing certifies nothing. If
+    no reduction applies (no inertia along a free direction), there are no gradients to check, and the
+    verification fails.
 
     **Arguments**
 

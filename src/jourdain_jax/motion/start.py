@@ -205,8 +205,8 @@ def _check_finite(name: str, value) -> None:
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
-    """Return masks of free coordinates and free speeds and of bounded coordinates, typical sizes, and whether
-    given values may contradict each other.
+    """Return masks of free coordinates, free speeds and bounded coordinates; typical sizes; and whether given
+    values may contradict each other.
 
     Omitted privileged speeds stay zero unless a dependent speed is given. Coordinates that are neither given
     nor guessed must lie in the domain, unless the constraints are affine and determine them uniquely.
