@@ -33,9 +33,7 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def attribute(x, name: str):
-    """Return an attribute, or None if reading it fails: an object's `__getattr__` may raise any error, and so
-    may an unset variable.
-    """
+    """Return an attribute, or None if reading it raises an error, as of an unset variable."""
     try:
         return getattr(x, name, None)
     except Exception:
@@ -43,10 +41,10 @@ def attribute(x, name: str):
 
 
 def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[str], Any]], ...]:
-    """Return the names that a function itself loads, each set with a function that reads one: globals, and
-    variables of enclosing functions (None if not yet set).
+    """Return two pairs, for globals and for variables of enclosing functions: the names that a function
+    itself reads, and a function from name to value (None if not yet set).
     """
-    # such as a counter of calls
+    # names that the function itself sets do not count, such as a counter of calls
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
     cells = {
@@ -59,8 +57,8 @@ def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[str], An
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
-    """Return the names used by code, or by the given instructions only, including attributes and inner
-    functions.
+    """Return the names that code uses, including attributes and inner functions. `operations`: only names of
+    these instructions.
     """
     own = frozenset(
         code.co_names

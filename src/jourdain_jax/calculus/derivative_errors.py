@@ -1,12 +1,12 @@
 """Errors of derivatives that do not exist, with their messages."""
 
 SECOND_ORDER_MESSAGE = (
-    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which only "
-    "machine code supports; with XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
+    "`simulate` was differentiated twice, with reverse mode (jax.hessian, grad of grad); only machine code "
+    "supports this. With XLA, dense matrices or a diffrax solver, use `jax.jacfwd(jax.jacfwd(f))`"
 )
 THIRD_ORDER_MESSAGE = (
-    "`simulate` was differentiated three times, not in forward mode alone; pass backend='xla' and use "
-    "forward mode, `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
+    "`simulate` was differentiated three times; third derivatives need forward mode alone: pass "
+    "backend='xla' and use `jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
 )
 
 

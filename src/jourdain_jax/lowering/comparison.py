@@ -99,6 +99,6 @@ def check_against_dense(
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}; {LIKELY}")
-    by_program = probes(found.events)[:, chosen][:, usable] if found.events else events.T[:, usable]
-    if not np.allclose(by_program, events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
+    values, expected = probes(found.events)[:, chosen][:, usable], events.T[:, usable]
+    if found.events and not np.allclose(values, expected, rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered(f"the value of a stop event {DIFFERS}")

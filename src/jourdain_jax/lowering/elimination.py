@@ -56,17 +56,12 @@ def eliminate(
         system.eliminated(order[-1])
     solution: dict[int, list[int]] = {}
     for pivot in reversed(order):
-        known = [
-            [(row[k], x) for k, x in solution.items() if row[k] != graph.zero]
-            for row in (system.A[r] for r in pivot.rows)
-        ]
-        rest = [
-            [
-                graph.sub(b, graph.total(graph.mul(a, x[j]) for a, x in terms))
-                for j, b in enumerate(system.right[r])
-            ]
-            for r, terms in zip(pivot.rows, known, strict=True)
-        ]
+        rest = []
+        for r in pivot.rows:
+            row = system.A[r]
+            known = [(row[k], x) for k, x in solution.items() if row[k] != graph.zero]
+            less = lambda j, known=known: graph.total(graph.mul(a, x[j]) for a, x in known)
+            rest.append([graph.sub(b, less(j)) for j, b in enumerate(system.right[r])])
         found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
         values = map(list, zip(*found, strict=True)) if found else ([] for _ in pivot.columns)
         solution |= zip(pivot.columns, values, strict=True)

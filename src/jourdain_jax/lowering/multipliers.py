@@ -68,8 +68,9 @@ def accelerations_by_multipliers(
     multipliers = solved.solution[0]
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
-    ratios = (graph.div(pivot, S[r][r]) for r, pivot in left)
-    sines = [graph.call("sqrt", graph.call("max", graph.zero, ratio)) for ratio in ratios]
+    sines = [
+        graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left
+    ]
     # least relative sine or length; below it round-off decides how a motion continues
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]

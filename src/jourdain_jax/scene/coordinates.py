@@ -175,6 +175,6 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if counts[name] > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs its own name")
         if name == "t" and kind != "input":
-            raise ValueError(f'{kind} name `t` is reserved for time (`motion["t"]`); choose another')
+            raise ValueError(f"{kind} name `t` is reserved for time (`motion.t`); choose another")
         if name in ("array", "slots", "keys"):
             raise ValueError(f"{kind} name `{name}` is reserved: `q.{name}` has a meaning; choose another")

@@ -41,7 +41,7 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
     )
     if numbers.shape not in ((6,), (4,)):
         raise ValueError(
-            f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of "
+            f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) for "
             "a body that is symmetric about its x-z plane; make them from an inertia matrix by `log_cholesky`"
         )
     zero = jnp.zeros((), numbers.dtype)

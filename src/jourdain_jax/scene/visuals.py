@@ -224,9 +224,8 @@ def shape(
     """Return a shape of this kind; the other arguments as for all shapes."""
     advice = "give three components in the body frame, m"
     at = checked_real(at, f"place of a {kind}", (3,), advice=advice).astype(real_type())
-    if turn is not None:
-        turn = checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     turn = jnp.eye(3) if turn is None else turn
+    turn = checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
 
 

@@ -163,7 +163,7 @@ class _Round(_Ground):
         """Store radius, side and motion, checked."""
         if side not in ("inside", "outside"):
             raise ValueError(
-                f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are"
+                f"side `{side}` is unknown; expected `inside` or `outside`, the side of the bodies"
             )
         self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
         self._moves(what, **motion)
