@@ -20,27 +20,15 @@ ENERGIES = ("energy", "kinetic energy", "potential energy")
 UNITS = {  # size in SI units, by kind of quantity
     "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
     "coordinate": {
-        "m": 1.0,
-        "km": 1e3,
-        "cm": 1e-2,
-        "mm": 1e-3,
-        "rad": 1.0,
-        "mrad": 1e-3,
-        "deg": np.pi / 180,
-        "turn": 2 * np.pi,
+        "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3,
+        "rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi,
     },
     "speed": {
-        "m/s": 1.0,
-        "km/h": 1 / 3.6,
-        "cm/s": 1e-2,
-        "mm/s": 1e-3,
-        "rad/s": 1.0,
-        "deg/s": np.pi / 180,
-        "turn/s": 2 * np.pi,
-        "rpm": np.pi / 30,
+        "m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3,
+        "rad/s": 1.0, "deg/s": np.pi / 180, "turn/s": 2 * np.pi, "rpm": np.pi / 30,
     },
     "energy": {"J": 1.0, "kJ": 1e3, "mJ": 1e-3},
-}
+}  # fmt: skip
 
 
 def check_format(path: FilePath) -> None:
