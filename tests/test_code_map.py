@@ -15,11 +15,11 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 470_455,
+    "code tokens of src": 470_480,
     "code tokens of docs": 11_517,
     "code tokens of notebooks": 7459,
     "caches": 49,
-    "named numbers": 299,
+    "named numbers": 300,
     "tests for a tracer": 58,
     "functions with more than 8 parameters": 2,
     "ways: projection of a state onto its constraints": 3,

@@ -19,6 +19,8 @@ from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
 
+ENOUGH = 8  # random states inside the domain
+
 
 @dataclass(frozen=True)
 class Assembled:
@@ -74,9 +76,10 @@ def assemble(
         return Assembled(q, nowhere(position_error, True), nowhere(shift, arrived), nowhere(outside, True))
 
     found, generator = judged(*newton(q, every)), np.random.default_rng(2)
-    for attempt in range(tries):
-        lost = ~(found.on_rows & (found.outside <= 1e-6)) & (generic | (attempt == 0))
-        if not lost.any():
+    for attempt in range(4 * tries):
+        inside = found.on_rows & (found.outside <= 1e-6)
+        lost = ~inside & (generic | (attempt == 0))
+        if not lost.any() or (attempt >= tries and np.sum(inside & generic) >= ENOUGH):
             break
         begin = generator.uniform(low, high, q.shape) if attempt else np.clip(q, low, high)
         which = np.flatnonzero(lost)

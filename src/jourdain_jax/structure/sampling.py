@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
-from jourdain_jax.structure.assembly import Assembled, coordinate_bounds, random_states
+from jourdain_jax.structure.assembly import ENOUGH, Assembled, coordinate_bounds, random_states
 from jourdain_jax.structure.probes import Probed, sampled_on_graph
 
 GUESSES = 8  # of a start, of each kind
@@ -116,8 +116,7 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
             f"defaults, or near 1 without a default: give defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
-    # with fewer than 8 random states inside the domain, the nearest ones count as well
-    return good & (found.outside <= max(outside[min(8, len(outside)) - 1], NEARLY_INSIDE))
+    return good & (found.outside <= max(outside[min(ENOUGH, len(outside)) - 1], NEARLY_INSIDE))
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
