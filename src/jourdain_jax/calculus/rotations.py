@@ -4,9 +4,9 @@ A rotation matrix `R` maps body components to space components, `r_space = R r_b
 velocity is `omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`.
 Quaternions are `(w, x, y, z)`.
 
-Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, a positive angle
-of `rot_z` turns to the left, of `rot_x` leans to the right, and of `rot_y` pitches the nose down and rolls a
-wheel ahead.
+Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, positive angles
+act as follows: `rot_z` turns to the left, `rot_x` leans to the right, `rot_y` pitches the nose down and rolls
+a wheel ahead.
 """
 
 from collections.abc import Callable, Sequence

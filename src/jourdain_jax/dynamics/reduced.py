@@ -1,10 +1,10 @@
 """Ignorable coordinates, found by probes, and the reduced Appell equations (42) without them (S9).
 
-A coordinate is *cyclic* if its rate is no privileged velocity and none of these quantities depends on it, in
-the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial velocities
-beta and gamma, the inertias R I R' of the bodies, the impressed forces and torques, the forces on speeds, and
-the potential's gradient. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if the
-privileged accelerations do not depend on it, which is a weaker condition.
+A coordinate is *cyclic* if its rate is no privileged velocity and these quantities do not depend on it: B and
+b of `qdot = B y + b`, the partial velocities beta and gamma, the inertias R I R' of the bodies, impressed
+forces and torques, forces on speeds, and the potential's gradient. All are taken in the inertial frame and in
+the privileged velocities y. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if
+the privileged accelerations do not depend on it, which is a weaker condition.
 
 Both kinds are fixed at the reference, and the system is integrated in the other, *kept* coordinates k alone:
 

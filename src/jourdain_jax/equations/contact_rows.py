@@ -98,8 +98,8 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
-    """Return the normal and tangential forces of the ground on the bodies as loads, and the forces A' L of
-    constraints that hold up to a force on the speeds.
+    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints that hold up
+    to a force give the forces A' L on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

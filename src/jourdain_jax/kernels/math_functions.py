@@ -72,8 +72,8 @@ def _within(w: Writer, x: Value, low: float, high: float) -> Value:
 
 
 def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Value, Value]:
-    """Return k and the two parts of p for e^(x + more) = 2^k (1 + p), where |x| < 2000 and `more` is small
-    relative to x.
+    """Return k and the two parts of p for e^(x + more) = 2^k (1 + p). `more` is small relative to x,
+    and |x| < 2000.
     """
     shifted = w.fma(x, 1 / math.log(2.0), WHOLE)
     turns, k = shifted - WHOLE, w.converted("bitcast", shifted, w.whole) - _bits(WHOLE)

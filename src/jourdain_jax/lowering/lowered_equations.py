@@ -44,7 +44,7 @@ class Stage:
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """Rates of the minimal state (q, y), or of the full state (y = u), of a class of scenes, as a scalar
-    program whose inputs include the parameters.
+    program. Its inputs include the parameters.
 
     Compared by identity, so that it can be a static argument of compiled functions.
     """
@@ -178,9 +178,9 @@ class Lowered:
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return the results of `rates`, the pivots, which must keep their signs, the directions of
-        constraints, and the smallest sine between a constraint with multiplier and the earlier ones (None
-        without multipliers). Only the rates have derivatives.
+        """Return the results of `rates`, the pivots, the directions of constraints, and the smallest sine
+        between a constraint with multiplier and the earlier ones (None without multipliers). Pivots must keep
+        their signs. Only the rates have derivatives.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """

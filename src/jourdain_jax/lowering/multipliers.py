@@ -4,9 +4,9 @@
     q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
     u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact if the constraints are affine in the speeds
 
-S is symmetric, positive definite if the constraints are independent, and sparse: tridiagonal for a chain. The
-remainder of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle
-between this constraint and the earlier ones. A square of 1e-k costs accelerations k digits.
+S is symmetric, positive definite if the constraints are independent, and sparse: tridiagonal for a chain.
+Elimination leaves a remainder of each diagonal entry of S. Relative to the entry, it is the squared sine of
+the angle between this constraint and the earlier ones. A square of 1e-k costs accelerations k digits.
 
 A constraint whose row vanishes at some configuration has a small entry instead of a small angle. Entries are
 therefore bounded from below by their size at a probe with the same parameters (`Probes.in_the_middle`). The

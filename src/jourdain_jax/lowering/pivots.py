@@ -3,8 +3,8 @@
 A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first.
 Other pivots are judged by their smallest value over all probes, relative to their row. Among good pivots, the
 one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
-eliminated together if their determinant cannot vanish. For example, components of the velocity of a hitch in
-rotated axes have a determinant that depends only on parameters, while each entry is zero at some angle.
+eliminated together if their determinant cannot vanish. Components of the velocity of a hitch in rotated axes
+are an example: each entry is zero at some angle, but the determinant depends only on parameters.
 
 If no order of elimination works, rows are combined. The rows a_1, a_2, ... of one column give one row with
 the pivot sum w_i a_i^2, and the others are made orthogonal to it. The constraints of a rolling wheel along

@@ -3,9 +3,9 @@
     relation    a < b, max(a, b), ...     sign(x), |x|     floor(x), ceil(x)     round(x)
     number      a - b                     x                sin(pi x)             sin(pi (x + 1/2))
 
-A relation counts if a rate or its slope differs between the two sides of the zero of its number, or if a stop
-event may have a dip there. Relations on which this number depends then count as well. Relations with equal
-branches, as in guards, do not count. A relation without a zero between probes counts.
+A relation counts if a rate or its slope differs between the two sides of the zero of its number. It also
+counts if a stop event may have a dip there. Relations on which this number depends then count as well.
+Relations with equal branches, as in guards, do not count. A relation without a zero between probes counts.
 
 Both branches are evaluated on both sides of zeros between probes, for all decisions of unrelated relations:
 the branches of `(x > a) & (y > b)` agree where y < b.

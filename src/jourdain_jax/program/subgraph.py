@@ -9,8 +9,8 @@ from jourdain_jax.program.graph import OPERATIONS, Graph
 
 
 def part_of(graph: Graph, needed: Iterable[int]) -> tuple[Graph, np.ndarray]:
-    """Return a new graph with only the needed nodes, which frees the memory of the others, and the new index
-    of every node of `graph` (-1 if not needed).
+    """Return a new graph with only the needed nodes, and the new index of every node of `graph` (-1 if not
+    needed). This frees the memory of the other nodes.
     """
     # in the old order, which keeps the order of terms in sums
     kept = [n for n in graph.reachable(needed) if n > graph.one]

@@ -181,10 +181,11 @@ class Scene(eqx.Module):
 
         The first of several events in one step counts. A value may fall through zero and rise again within
         one step. Such an event is found if a relation in it (`<`, `where`, `abs`, ...) changes. Default
-        solvers also find it if the cubic through values and rates at the ends of the step is negative, other
-        adaptive solvers if the dense output is at one of three times. Otherwise a smooth dip of an event
-        narrower than the longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that
-        holds for less than that. Use values that fall only once, or a smaller `max_step`.
+        solvers also find it if the cubic through values and rates at the ends of the step is negative. Other
+        adaptive solvers find it if the dense output is negative at one of three times. Otherwise a smooth dip
+        of an event narrower than the longest step may be missed, as may a condition such as
+        `jnp.linalg.norm(x) < r` that holds for less than that. Use values that fall only once, or a smaller
+        `max_step`.
         """
         return {}
 

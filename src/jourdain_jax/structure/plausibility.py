@@ -100,8 +100,8 @@ def _nowhere(x):
 
 
 def _exceeds_the_others(x):
-    """Return whether the largest moment of a body exceeds the sum of the others by one per cent, since both
-    are equal for thin wheels up to the digits of published values. Rods are exempt.
+    """Return whether the largest moment of a body exceeds the sum of the others by one per cent. For thin
+    wheels both are equal, up to the digits of published values. Rods are exempt.
     """
     least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
     return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))

@@ -94,10 +94,10 @@ def redundant_rows(
     """Return rows that may be omitted, later rows first: the others keep the rank at every probed state and
     stay well conditioned.
 
-    An omitted row is a combination of the others with bounded coefficients. This excludes, for example, the
-    lateral row of one wheel of an axle as a combination of its longitudinal row and rows of the other wheel,
-    whose coefficients are tangents of the heading. `generic`: which of the states `found` are random; `far`:
-    function that returns rows at distant angles.
+    An omitted row is a combination of the others with bounded coefficients. Coefficients may be unbounded:
+    the lateral row of one wheel of an axle is a combination of its longitudinal row and the rows of the other
+    wheel, with tangents of the heading. `generic`: which of the states `found` are random; `far`: function
+    that returns rows at distant angles.
     """
     if not ranks:  # no usable state is reported as another fault
         return ()

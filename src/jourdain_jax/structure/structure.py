@@ -164,8 +164,9 @@ def structure_of(scene: Scene) -> Structure:
 
     They are found once per class and parameter values, at random and symmetric states of the domain. Concrete
     numbers replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not
-    move smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For
-    known parameters, impossible numbers of bodies or planes and contradictory constraints also raise it.
+    move smoothly, or if a free motion has no inertia. It is also raised if `privileged` names unknown or too
+    few speeds and, for known parameters, by impossible numbers of bodies or planes and by contradictory
+    constraints.
     """
     structure = structure_whatever_its_faults(scene)
     # replaced parameters prove nothing about bodies and grounds

@@ -4,11 +4,11 @@ them.
     x + gap n(x) = P(n(x)),   f(x) = 0       x: point of the ground f = 0,  n: its normal
                                              P(n): lowest point of the body, with n upwards
 
-On a plane n is known. A ball near a cylinder or sphere, and a wheel near a sphere, have a constant distance
-from a core, the ball's centre or the circle within the tyre. The nearest point of the core has a closed form.
-In all other cases Newton's method solves for x and the gap, four unknowns, with derivatives by the implicit
-function theorem. If it does not converge, the result is NaN. Source: P. Wriggers, Computational Contact
-Mechanics (2006), on closest points.
+On a plane n is known. The surface of a ball or a wheel has a constant distance from a core: the ball's
+centre, or the circle within the tyre. Near a cylinder or sphere (ball) or near a sphere (wheel), the nearest
+point of the core has a closed form. In all other cases Newton's method solves for x and the gap, four
+unknowns, with derivatives by the implicit function theorem. If it does not converge, the result is NaN.
+Source: P. Wriggers, Computational Contact Mechanics (2006), on closest points.
 """
 
 import equinox as eqx

@@ -169,8 +169,8 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
       keeps its direction, as in a plane; otherwise a result code reports it.
 
     It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    height or a length that is not positive, and when the scene is built for a ball that is too large for its
-    cylinder or sphere.
+    height or a length that is not positive. A ball that is too large for its cylinder or sphere raises it
+    when the scene is built.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 

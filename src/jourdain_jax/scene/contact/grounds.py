@@ -89,8 +89,8 @@ class Plane(_Ground):
     `velocity` and `angular_velocity`. These also include motion within the plane, as of a belt or a
     turntable. Along the normal both must agree, which is checked when a scene is probed.
 
-    Raises ValueError for an `along` normal to the plane, for both `tilt` and `normal`, and when the scene is
-    built for a normal that is not a unit vector.
+    Raises ValueError for an `along` normal to the plane, and for both `tilt` and `normal`. A normal that is
+    not a unit vector raises it when the scene is built.
     """
 
     normal: Vector3  # unit vector, out of the ground
@@ -192,8 +192,8 @@ class Cylinder(_Round):
     origin; `angular_velocity` (rad/s): `rate * axis` for a turning drum. All vectors are in the inertial
     frame. The no-slip constraints act along the axis and around it.
 
-    Raises ValueError for a radius that is not positive or an unknown side, and when the scene is built for an
-    axis that is not a unit vector.
+    Raises ValueError for a radius that is not positive or an unknown side. An axis that is not a unit vector
+    raises it when the scene is built.
     """
 
     axis: Vector3  # unit vector
