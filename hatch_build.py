@@ -1,4 +1,6 @@
-"""Metadata that follow from the repository's address, the setting `repository` in pyproject.toml: the project's links, and those of the README elsewhere."""
+"""Metadata that follow from the repository's address, the setting `repository` in pyproject.toml: the links
+of the project and of its README.
+"""
 
 import re
 from pathlib import Path
@@ -7,7 +9,7 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 
 class Links(MetadataHookInterface):
-    """Fill in `urls` and `readme`; without an address there are no links, and those of the README stay relative."""
+    """Fill in `urls` and `readme`. Without an address there are no links, and the README's stay relative."""
 
     def update(self, metadata: dict) -> None:
         """Set the two fields."""

@@ -32,8 +32,16 @@ from jourdain_jax.calculus.files import FilePath, name_of, parsed, read_bytes, s
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.studies.design import MOST_SAMPLES
 from jourdain_jax.studies.folder_lock import locked
-from jourdain_jax.studies.manifest import GRID, MANIFEST, digest, digest_of, write_manifest
-from jourdain_jax.studies.receipt import Receipt, crc32c, with_checksum
+from jourdain_jax.studies.records import (
+    GRID,
+    MANIFEST,
+    Receipt,
+    crc32c,
+    digest,
+    digest_of,
+    with_checksum,
+    write_manifest,
+)
 from jourdain_jax.studies.statistics import Tally
 
 FORMAT = 2

@@ -1,15 +1,21 @@
-"""The receipt of a finished chunk of a study: its samples, its share of the statistics, its checksums."""
+"""Records of a study on disk, with checksums: the receipt of each finished chunk, and the manifest, which
+holds the digests of files that are written once.
+"""
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.studies.statistics import Tally
 
+MANIFEST, GRID = "run/manifest.json", "run/grid.json"
 _BEGIN = b"jourdain-jax chunk 2\n"
 
 
@@ -65,3 +71,19 @@ def with_checksum(content: bytes) -> bytes:
 
 def crc32c(content) -> int:
     return needed("google_crc32c", "storing a study", "studies").value(content)  # a dependency of zarr
+
+
+def digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def digest_of(digests: Mapping[str, str]) -> str:
+    return digest(json.dumps(digests, sort_keys=True).encode())
+
+
+def write_manifest(path: Path, digests: Mapping[str, str]) -> None:
+    write_whole(
+        path / MANIFEST,
+        json.dumps({"digests": dict(digests), "digest": digest_of(digests)}, indent=1).encode(),
+        wait=True,
+    )
