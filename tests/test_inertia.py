@@ -151,8 +151,40 @@ def test_a_motion_that_starts_without_inertia_says_so_instead_of_inventing_an_ac
 
 def test_a_lane_without_mass_says_so_and_harms_no_other():
     lanes = jj.rollout(Geared(), {}, parameters={"mass": np.array([2.0, 0.0])}, t1=2.0)
-    assert lanes.result.tolist() == [results.SUCCESS, results.NOT_FINITE]
+    assert lanes.result.tolist() == [results.SUCCESS, results.BAD_PARAMETER]
     assert_allclose(lanes.lane(0).q_end[0], 5.0, rtol=1e-7)
+
+
+class Parted(jj.Scene):
+    """A body whose mass, and one whose inertia, is what is left of a number; the second is pushed along x."""
+
+    coordinates = jj.coordinates("x y angle")
+    whole: object = jj.parameter(1.5)
+    part: object = jj.parameter(0.5)
+    moments: object = jj.parameter(1.0)
+
+    def bodies(self, t, q):
+        turned = jj.rot_z(q.angle)
+        body = jj.RigidBody(1.0, self.moments * jnp.ones(3), [q.x, 0.0, 0.0], turned)
+        return {"body": body, "left": jj.Particle(self.whole - self.part, [q.x, q.y, 0.0])}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=1.0),)
+
+
+@pytest.mark.parametrize("backend", ["native", "xla", "dense"])
+def test_lanes_in_which_a_free_motion_has_no_inertia_are_wrong_parameters(backend):
+    # no force acts along y, or turns the body: the lost inertia had left the equations
+    numbers = {"part": np.array([0.5, 1.5, 0.5, 0.5]), "moments": np.array([1.0, 1.0, 0.0, np.nan])}
+    lanes = jj.rollout(Parted(), {"y_rate": 0.1}, parameters=numbers, t1=1.0, backend=backend, progress=False)
+    assert lanes.result.tolist() == [results.SUCCESS] + 3 * [results.BAD_PARAMETER]
+
+
+def test_a_motion_without_inertia_in_jit_is_a_wrong_parameter():
+    def code(whole):
+        return jj.simulate(Parted(whole=whole), {"y_rate": 0.1}, t1=1.0).result
+
+    assert [int(jax.jit(code)(whole)) for whole in (1.0, 0.5)] == [results.SUCCESS, results.BAD_PARAMETER]
 
 
 def test_derivatives_at_a_state_with_inertia_are_finite_beside_the_guard():

@@ -6,6 +6,7 @@
     d[n.(p - o)]/dt = - n.(v + w x (p - o))    p fixed; a plane's motion, stated by o, n and by v, w
     dg/dt along the motion of other bodies = 0  or  v, w != 0      g: pose of a contact's ground
     I_3 <= I_1 + I_2
+    x' M x > 0 for motions x with A x = 0
 
 The table `CHECKS` has these checks as functions of numbers at some states. It is evaluated when a scene is
 probed, and a fault raises its text. Checks with a `label` also run in the compiled program of each motion,
@@ -24,8 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Flag, all_finite, at_index, largest
-from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.calculus.reals import Flag, array_module, at_index, eps_of, largest
+from jourdain_jax.equations.instant import derivatives_in_speeds
+from jourdain_jax.equations.kinematics import inertias_of, motion_at, pose_at
+from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.names import Sentences
 from jourdain_jax.scene.scene import Scene
@@ -95,8 +98,31 @@ def _off(square):
 
 def _nowhere(x):
     """Return one flag per state: true for all if no state has finite numbers."""
-    bad = ~all_finite(x.reshape(len(x), -1), axis=1)
-    return bad & np.all(bad)
+    bad = ~array_module(x).isfinite(x.reshape(len(x), -1)).all(1)
+    return bad & bad.all()
+
+
+def without_inertia(M, A):
+    """Return whether a motion that the rows A permit has no inertia, at each state: whether a pivot of K is
+    zero, to round-off. The null vectors of K are those of M with A x = 0, since both terms are >= 0.
+
+        K = M + A' A    in speeds of unit inertia, with rows of unit length
+
+    A pivot that is NaN is not zero.
+    """
+    xp, n = array_module((M, A)), M.shape[-1]
+    own = xp.stack([M[..., i, i] for i in range(n)], -1)
+    scale = 1 / xp.sqrt(xp.where(own > 0, own, 1.0))
+    M, A = scale[..., :, None] * M * scale[..., None, :], A * scale[..., None, :]
+    square = xp.sum(A * A, -1)
+    A = A / xp.sqrt(xp.where(square > 0, square, 1.0))[..., None]
+    K, wrong = M + xp.swapaxes(A, -1, -2) @ A, xp.zeros(M.shape[:-2], bool)
+    size = [K[..., i, i] for i in range(n)]
+    for i in range(n):
+        row, zero = K[..., i, :], K[..., i, i] <= 16 * n * eps_of(M) * size[i]
+        K = K - row[..., :, None] * row[..., None, :] / xp.where(zero, 1.0, row[..., i])[..., None, None]
+        wrong = wrong | zero
+    return wrong
 
 
 def _exceeds_the_others(x):
@@ -141,10 +167,11 @@ def _stated_twice(kind: str) -> Check:
     )
 
 
+_OF_BODIES = ("mass", "inertia")
 CHECKS = (
     *(
-        Check(piece, _nowhere, _says_nothing(piece))
-        for piece in ("mass", "inertia", "orientation", "position")
+        Check(piece, _nowhere, _says_nothing(piece), f"no finite {piece}" if piece in _OF_BODIES else "")
+        for piece in (*_OF_BODIES, "orientation", "position")
     ),
     Check(
         "touch",
@@ -259,6 +286,7 @@ CHECKS = (
 )
 
 
+NO_INERTIA = "no inertia along a free direction"
 BY_ROWS = "gap", "own plane"  # kinds of numbers that depend on the projection onto geometric constraints
 
 
@@ -279,7 +307,14 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
         lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states
     )
     seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
-    return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
+    found = {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
+    if len(others):
+        at, place, moving = (x[0] for x in elsewhere(scene))
+        by_speeds, _, motion = derivatives_in_speeds(scene, at, place, moving, inputs)
+        weights, moved = inertias_of(motion), by_speeds.bodies
+        M = mass_matrix(weights.mass, weights.inertia, moved.linear, moved.angular)
+        found[NO_INERTIA] = without_inertia(M, by_speeds.rows)
+    return found
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:

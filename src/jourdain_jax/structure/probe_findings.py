@@ -7,6 +7,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import all_finite, at_index, eps_of, largest
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.plausibility import without_inertia
 from jourdain_jax.structure.probes import Probed, probed_on_graph
 from jourdain_jax.structure.rank import Scaled, scaled_states
 from jourdain_jax.structure.sampling import symmetric_configurations
@@ -86,17 +87,12 @@ def is_singular(M: np.ndarray) -> bool:
     return bool(np.all(least <= 16 * M.shape[1] * eps_of(M)))
 
 
-def check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
-    """Raise ValueError for speeds along which a free motion has no inertia at any generic state."""
-    moved = []
-    for A, M, c in zip(found.A, found.M, found.c, strict=True):
-        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
-        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
-        if not sizes.size or sizes[0] > 16 * len(M) * eps_of(M):
-            return
-        moved.append(np.abs(c * (free @ directions[:, 0])))
-    if not moved:
+def check_inertia(scene: Scene, found: Scaled) -> None:
+    """Raise ValueError for speeds along which a free motion has no inertia at any of the states."""
+    if not (len(found.M) and without_inertia(found.M, found.A).all()):
         return
+    directions = np.linalg.eigh(np.nan_to_num(found.M + found.A.mT @ found.A, nan=1.0))[1][..., 0]
+    moved = np.abs(found.c * directions)
     share = np.median([x / x.max() for x in moved], axis=0)
     moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
     names = ", ".join(moving) + (" together" if len(moving) > 1 else "")

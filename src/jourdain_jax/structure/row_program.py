@@ -5,7 +5,7 @@
 Unit norms of quaternions count as geometric constraints g.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from jourdain_jax.program.subgraph import part_of
 from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
 from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere
+from jourdain_jax.structure.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere, without_inertia
 from jourdain_jax.structure.probes import LookedAt, looked_at
 
 Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
@@ -56,11 +56,12 @@ def row_program(scene: Scene) -> RowProgram | None:
     scene = with_reference_parameters(scene)
     try:
         nodes = looked_at(scene)
-        right, others = _right(scene, nodes)
+        graph, traced = nodes.graph, nodes.traced
+        q, u = traced.q.tolist(), traced.u.tolist()
+        A, M = _entries(nodes.rows, u), _mass_matrix(nodes, u)
+        right, others = _right(scene, nodes, A, M)
     except Unsupported:
         return None
-    graph, traced = nodes.graph, nodes.traced
-    q, u = traced.q.tolist(), traced.u.tolist()
     parts: dict[str, Any] = {
         "t": traced.t,
         "q": q,
@@ -69,8 +70,8 @@ def row_program(scene: Scene) -> RowProgram | None:
         "g": nodes.closures,
         "G": _entries(nodes.of_closures, q),
         "phi": traced.at.phi.tolist(),
-        "A": _entries(nodes.rows, u),
-        "M": _mass_matrix(nodes, u),
+        "A": A,
+        "M": M,
         "right": right,
         "others": others,
     }
@@ -85,14 +86,14 @@ def row_program(scene: Scene) -> RowProgram | None:
     return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
 
 
-def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
+def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple[int, list[int]]:
     """Return the node of a truth value, true for valid parameters, and the coordinates of other states on
     which it depends.
 
-    Parameters are valid if each is finite, has its required sign, and causes no fault of
-    `plausibility.CHECKS` at the start and at states from `elsewhere`. The coordinates of these states depend
-    on parameters if the geometric constraints do. Faults that do not depend on parameters are found when the
-    scene is probed.
+    Parameters are valid if each is finite, has its required sign, causes no fault of `plausibility.CHECKS`
+    at the start and at states from `elsewhere`, and leaves no free motion without inertia. The coordinates of
+    these states depend on parameters if the geometric constraints do. Faults that do not depend on parameters
+    are found when the scene is probed.
     """
     g, traced = looked.graph, looked.traced
     states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0
@@ -116,17 +117,40 @@ def _right(scene: Scene, looked: LookedAt) -> tuple[int, list[int]]:
     matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))
     kept = {kind: [x for x in of if matters(kind, x)] for kind, of in every.items()}
     stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
-    nodes = [*traced.parameters, *stacked.values()]
+    generic = dict(zip(varying, map(g.const, np.concatenate([np.ravel(x) for x in states[0]])), strict=True))
+    free = _inertia_elsewhere(looked, A, M, generic) if M and _may_vanish(scene, looked) else []
+    nodes = [*traced.parameters, *stacked.values(), *free]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
 
     def right(*given):
-        faults = parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()
-        return ~jnp.any(jnp.stack([*faults, any_wrong(dict(zip(stacked, given[count:], strict=True)))]))
+        faults = [*parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()]
+        faults += [without_inertia(*given[-2:])] if free else []
+        return ~jnp.any(jnp.stack([*faults, any_wrong(dict(zip(stacked, given[count:], strict=False)))]))
 
     closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
     (found,) = interpret(g, closed, [Nodes(x) for x in nodes])
     node, given = int(as_nodes(g, found)), [n for state in on_rows for n in state]
     return node, given if any(depend_on(g, [node], given)) else []
+
+
+def _may_vanish(scene: Scene, looked: LookedAt) -> bool:
+    """Return whether a mass or inertia depends on a parameter that may be zero."""
+    positive = {f.name for f in fields(scene) if f.metadata.get("positive")}
+    leaves = zip(jax.tree_util.tree_leaves_with_path(scene), looked.traced.parameters, strict=True)
+    others = [n for (path, _), leaf in leaves if path[0].name not in positive for n in leaf.ravel().tolist()]
+    weights = [*looked.traced.at.mass.ravel().tolist(), *looked.traced.at.inertia.ravel().tolist()]
+    return any(depend_on(looked.graph, weights, others))
+
+
+def _inertia_elsewhere(looked: LookedAt, A: Matrix, M: Matrix, state: dict[int, int]) -> list[np.ndarray]:
+    """Return the nodes of the mass matrix and of the rows at another state, as arrays."""
+    graph, n = looked.graph, len(looked.traced.u)
+    found = [np.full((n, n), graph.zero), np.full((len(looked.rows), n), graph.zero)]
+    for matrix, entries in zip(found, (M, A), strict=True):
+        for (i, k), node in zip(entries, graph.substituted(list(entries.values()), state), strict=True):
+            matrix[i, k] = node
+    found[0] = np.where(graph.zero != found[0].T, found[0].T, found[0])
+    return found
 
 
 def _entries(rows: list[dict[int, int]], variables: list[int]) -> Matrix:

@@ -252,7 +252,7 @@ def _probed_structure(scene: Scene) -> Structure:
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is reported as a fault instead
-        check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)), rank)
+        check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
