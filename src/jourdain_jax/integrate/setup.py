@@ -129,22 +129,24 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     judged: bool  # whether probing has already checked these parameters, at many states
     reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
 
-    def fitting(self) -> "Setup":
+    @property
+    def timely(self) -> "Flag | np.bool_":
+        """Return whether the times are consistent."""
+        # slip, impact and rest cannot be reversed in time
+        forwards = (self.t1 > self.t0) | (not self.scene.switching.contacts)
+        return times_fit(self.ts, self.t0, self.t1) & forwards
+
+    def fitting(self, timely: "Flag | np.bool_") -> "Setup":
         """Return the setup with times that any loop accepts: round-off puts none beyond the end, and a short
         span replaces inconsistent times.
         """
         ts, t0, t1 = self.ts, self.t0, self.t1
-        fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+        direction = jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        even = jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype)
-        shares = {"ts": even, "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
         # 1e-9 s, for motions that are not requested
-        return self._replace(
-            **{
-                name: jnp.where(fits, inside if name == "ts" else getattr(self, name), 1e-9 * x)
-                for name, x in shares.items()
-            }
-        )
+        short = {"ts": np.linspace(0.0, 1e-9, len(ts)), "t0": 0.0, "t1": 1e-9, "dt0": 1e-10, "longest": 1e-9}
+        own = self._replace(ts=inside)
+        return self._replace(**{name: jnp.where(timely, getattr(own, name), x) for name, x in short.items()})
 
     @property
     def reason_against_machine_code(self) -> str:

@@ -21,7 +21,7 @@ from jourdain_jax.integrate import integrands, result_codes
 from jourdain_jax.integrate.inputs import Inputs, Mode, in_phases
 from jourdain_jax.integrate.loop import native_motion, value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
-from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved, times_fit
+from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
 from jourdain_jax.integrate.time_programs import for_programs
 from jourdain_jax.integrate.vector_fields.field import ByProgram
@@ -50,9 +50,10 @@ def integrate(setup: Setup) -> Trajectory:
 def _one_motion(setup: Setup) -> Trajectory:
     given = _in_contact(_with_machine_code(_prepared(setup)))
     setup, asked = _entered(given)
-    begun, fitting = _begin(setup), setup.fitting()
+    timely = given.timely
+    begun, fitting = _begin(setup, timely), setup.fitting(timely)
     if not setup.reason_against_machine_code:
-        begun = replace(begun, plain=_plain(given))
+        begun = replace(begun, plain=_plain(given, timely))
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
 
@@ -92,7 +93,8 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
         return eqx.filter_vmap(lambda *own: _one_motion(lane(*own)))(*varied)
     given = eqx.filter_vmap(_in_contact)(_with_machine_code(_prepared(setups)))
     setups, asked = eqx.filter_vmap(_entered)(given)
-    begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
+    timely = eqx.filter_vmap(lambda setup: setup.timely)(given)
+    begun, fitting = eqx.filter_vmap(_begin)(setups, timely), eqx.filter_vmap(Setup.fitting)(setups, timely)
     solved = setups.integrator.lanes_solved(fitting, begun)
     return eqx.filter_vmap(_finish)(given, fitting, asked, begun, solved)
 
@@ -108,10 +110,10 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
-def _plain(setup: Setup) -> Plain:
+def _plain(setup: Setup, timely: Flag) -> Plain:
     """Return the numbers of a setup before `_entered`; numbers shared by all motions have no batch axis."""
     setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
-    own = setup.fitting()
+    own = setup.fitting(timely)
     times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
     args = setup.field, setup.scene, setup.inputs, setup.field.fixed(setup.scene), setup.t0
     return Plain(times, tuple(native_motion.known_of(args)))
@@ -136,15 +138,12 @@ def _in_contact(setup: Setup) -> Setup:
     )
 
 
-def _begin(setup: Setup) -> Begun:
+def _begin(setup: Setup, timely: Flag) -> Begun:
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
     right, start = _without_faults(setup, start)
     args = field, scene, setup.inputs, field.fixed(scene), setup.t0
-    timely = times_fit(setup.ts, setup.t0, setup.t1)
-    # slip, impact and rest cannot be reversed in time
-    timely &= (setup.t1 > setup.t0) | (not scene.switching.contacts)
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
