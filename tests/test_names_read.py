@@ -97,6 +97,7 @@ NOTICED = {
     "a function of JAX": ("law = jnp.add", "law(0.5, 0.5)", "law = lambda a, b: 4.0"),
     "a slice": ("k = slice(0, 1)", "jnp.array([1.0, 4.0])[k][0]", "k = slice(1, 2)"),
     "a fraction": ("k = fractions.Fraction(1)", "float(k)", "k = fractions.Fraction(4)"),
+    "a dtype": ("k = np.dtype(np.int64)", "1.0 if k == np.int64 else 4.0", "k = np.dtype(np.float32)"),
     "an enumeration": (
         "Kind = enum.Enum('Kind', 'soft stiff')\nk = Kind.soft",
         "1.0 if k is Kind.soft else 4.0",

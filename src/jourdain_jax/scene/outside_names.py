@@ -169,7 +169,7 @@ def _content(x: Any) -> Hashable:
     Raises StatefulError for values that may change: arrays, containers, objects.
     """
     own = getattr(x, "__dict__", None) or {}
-    if type(x) in _EXACTLY or isinstance(x, np.number | np.bool_ | PurePath):
+    if type(x) in _EXACTLY or isinstance(x, np.number | np.bool_ | np.dtype | PurePath):
         return type(x), repr(x)
     if isinstance(x, slice):
         parts = x.start, x.stop, x.step

@@ -6,6 +6,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import all_finite, at_index, eps_of, largest
 from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.names import Sentences
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import without_inertia
 from jourdain_jax.structure.probes import Probed, probed_on_graph
@@ -87,19 +88,19 @@ def is_singular(M: np.ndarray) -> bool:
     return bool(np.all(least <= 16 * M.shape[1] * eps_of(M)))
 
 
-def check_inertia(scene: Scene, found: Scaled) -> None:
-    """Raise ValueError for speeds along which a free motion has no inertia at any of the states."""
+def no_inertia(scene: Scene, found: Scaled) -> Sentences:
+    """Return a sentence if a free motion has no inertia at any of the states; it names the speeds."""
     if not (len(found.M) and without_inertia(found.M, found.A).all()):
-        return
+        return ()
     directions = np.linalg.eigh(np.nan_to_num(found.M + found.A.mT @ found.A, nan=1.0))[1][..., 0]
     moved = np.abs(found.c * directions)
     share = np.median([x / x.max() for x in moved], axis=0)
     moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
     names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
-    raise ValueError(
+    return (
         f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
         "constraint determines it; give a body that moves with it a mass (or inertia), add a constraint, or "
-        "omit the coordinate"
+        "omit the coordinate",
     )
 
 

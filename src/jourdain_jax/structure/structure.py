@@ -27,11 +27,11 @@ from jourdain_jax.structure.plausibility import sentences
 from jourdain_jax.structure.probe_findings import (
     RANDOM_PROBES,
     at_probes,
-    check_inertia,
     exceeds,
     far_rows,
     is_singular,
     moves,
+    no_inertia,
     sizes,
     speed_terms,
 )
@@ -251,8 +251,8 @@ def _probed_structure(scene: Scene) -> Structure:
     scaled = scaled_states(found, typical)
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
-    if not faults:  # a negative mass is reported as a fault instead
-        check_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
+    # a negative mass is another fault
+    faults = faults or no_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged

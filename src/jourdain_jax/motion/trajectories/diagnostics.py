@@ -15,7 +15,7 @@ from jourdain_jax.integrate.result_codes import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.integrate.vector_fields.field import reason_for_matrices
 from jourdain_jax.motion.trajectories.values_in_time import Checked, Checks, Record, map_over_times
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.structure.structure import structure_of, usual_rows
+from jourdain_jax.structure.structure import structure_whatever_its_faults, usual_rows
 
 OverTimes = Float[Array, "*lanes times"]
 
@@ -129,7 +129,9 @@ def lost_of(trajectory: Record) -> OverTimes | None:
 
 def _lacks_work(trajectory: Record) -> bool:
     """Return whether work was done but not integrated, so that T + V is not constant."""
-    return trajectory.work is None and needs_work(trajectory.scene, structure_of(trajectory.scene))
+    return trajectory.work is None and needs_work(
+        trajectory.scene, structure_whatever_its_faults(trajectory.scene)
+    )
 
 
 def _extremes(force: ContactForce) -> ContactExtremes:
@@ -193,7 +195,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         )
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
-    by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
+    by_clock = not trajectory.inputs.constant or bool(structure_whatever_its_faults(trajectory.scene).timed)
     # a clock that resolves less than this part of a step rounds times noticeably
     if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
@@ -215,7 +217,7 @@ def summary(trajectory: Record, message: str) -> str:
         if trajectory.state_form == "full"
         else f"; pivot of the independent speeds at least {float(trajectory.smallest_pivot):.1e}"
     )
-    dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.inputs.constant)
+    dense = reason_for_matrices(structure_whatever_its_faults(trajectory.scene), trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
     moved, left = (float(trajectory.moved_q), float(trajectory.moved_u)), _left_domain(trajectory)
     lost = left if int(trajectory.result) == SINGULAR_PARTITION else ""

@@ -26,7 +26,7 @@ from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import invariants_of
-from jourdain_jax.structure.structure import structure_of
+from jourdain_jax.structure.structure import structure_whatever_its_faults
 
 
 class Phases(eqx.Module, Printed):
@@ -119,7 +119,9 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     """
     first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))
     # accelerations depend on the rates of the inputs
-    by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs
+    by_inputs = (
+        by_inputs and not record.inputs.constant and structure_whatever_its_faults(first()).rows_of_inputs
+    )
     known = not is_traced((f, record))
     # for one concrete motion NumPy finishes before a program is compiled (contact forces of a bicycle at
     # 101 times: 1 s instead of 7)
