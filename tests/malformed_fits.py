@@ -240,7 +240,7 @@ SENSORS: dict[str, str] = {
         "command of input `push` of run 0 of `Cart` ends at 1 s, before"
     ),
     "with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0]))": (
-        "is sampled from 1700000000 to 1700000004 s, but the run is from 0 to 4 s, where the input"
+        "is sampled from 1700000000 to 1700000004 s, but the run is from 0 to 4 s; take both from one clock"
     ),
     "jj.fit(cart, shown(), {'mass': jj.Estimate(per_run=True)})": (
         "`free` has a `mass` for each run, but all runs share the scene"

@@ -499,10 +499,10 @@ STATES: dict[str, Case] = {
         "`reduction` is the class `NullSpaceQR`, expected a name (privileged, qr,"
     ),
     "jj.accelerations(b, 0.0, two, two, reduction=jj.equations.Privileged((0, 7)))": (
-        "`independent` is (0, 7), expected different indices of speeds of `Bead`"
+        "`independent` is (0, 7), expected indices of speeds of `Bead`"
     ),
     "jj.accelerations(b, 0.0, two, two, reduction=jj.equations.Privileged(('x_rate',)))": (
-        "`independent` is ('x_rate',), expected different indices"
+        "`independent` is ('x_rate',), expected indices of speeds"
     ),
     "jj.accelerations(b, 0.0, two, two, stabilisation=5.0)": (
         "`stabilisation` is a float, expected `jj.Baumgarte(alpha, beta)` or None"
@@ -953,7 +953,7 @@ COMMANDS: dict[str, Case] = {
 
 ANSWERS: dict[str, Case] = {
     "answered(loads=lambda self, m: None)": (
-        "`loads` of `Described` returned `None`, expected a tuple of loads; write return"
+        "`loads` of `Described` returned `None`, expected a tuple of loads; write `return"
     ),
     "answered(loads=lambda self, m: {'weight': 1.0})": (
         "`loads` of `Described` returned a dict, expected a tuple of loads"

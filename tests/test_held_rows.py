@@ -1,4 +1,4 @@
-"""Rows that hold up to a force: friction in joints, and blades that slip sideways."""
+"""Rows that hold until their force exceeds a limit: friction in joints, and blades that slip sideways."""
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def test_a_joint_at_rest_may_hold_with_more_than_it_slips_with(derivative):
 
 
 class Sled(jj.Scene):
-    """A sled whose blade, along its axis under the mass centre, holds up to a force sideways."""
+    """A sled whose blade, along its axis under the mass centre, slips sideways above a force."""
 
     holds: float = jj.parameter(3.0)
     coordinates = jj.coordinates("x y yaw")
@@ -129,7 +129,7 @@ def test_a_blade_slips_where_a_turn_needs_more_than_it_holds(derivative):
 
 
 class Braked(jj.Scene):
-    """A wheel on a floor with a brake that holds up to a torque."""
+    """A wheel on a floor with a brake that slips above a torque."""
 
     brake: float = jj.parameter(9.0)
     coordinates = jj.coordinates("x z spin")

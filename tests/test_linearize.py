@@ -210,7 +210,7 @@ def test_derivatives_pass_through_linearisation(derivative):
     [
         (("learn",), {}, "no coordinate `learn` to perturb; did you mean `lean`"),
         (("pitch",), {"dependent": ("pitch",)}, "in `dependent`"),
-        (("yaw",), {}, "not among the privileged speeds"),
+        (("yaw",), {}, "not all rates of the coordinates `yaw` are privileged"),
         (("lean",), {"privileged": ("lean_rte",)}, "unknown privileged speed"),
         (("lean", "pitch"), {}, "make the given coordinates dependent"),
     ],

@@ -47,7 +47,9 @@ def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
 
 def test_a_file_in_place_of_the_folder_is_left_alone_with_one_warning(folder):
     folder.write_text("mine")
-    with pytest.warns(UserWarning, match=f"{folder}` is not used .*a file.*JOURDAIN_JAX_CACHE") as said:
+    with pytest.warns(
+        UserWarning, match=f"not cached in the folder `{folder}`.*a file.*JOURDAIN_JAX_CACHE"
+    ) as said:
         assert _all_kept("a", "a") == [b"code of a"] * 2
     assert len(said) == 1
     assert folder.read_text() == "mine"

@@ -100,8 +100,8 @@ def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     if len(beside) + len(coordinates) == len(y):
         return np.array(beside, int)
     raise ValueError(
-        f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the "
-        f"privileged speeds of `{type(scene).__name__}` "
-        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates whose "
-        "rates are privileged, or give `privileged` with the rates of these coordinates"
+        f"not all rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are privileged "
+        f"speeds of `{type(scene).__name__}` "
+        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates with "
+        "privileged rates, or name the rates of these coordinates in `privileged`"
     )

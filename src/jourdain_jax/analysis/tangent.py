@@ -144,8 +144,8 @@ def dependent_coordinates(
     dependent: Labels | None,
     G: Float[np.ndarray, "rows coordinates"] | None = None,
 ) -> Int[np.ndarray, "dependent"]:
-    """Return indices of the dependent perturbations `ds`, which the geometric constraints determine: the
-    named ones, else well conditioned ones.
+    """Return indices of the dependent perturbations `ds`, which the geometric constraints determine:
+    `dependent` if given, else a well conditioned choice.
 
     `G`: dg/dq at the state, if known; otherwise states of the scene's domain are used.
     """

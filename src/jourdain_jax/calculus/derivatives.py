@@ -171,7 +171,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 
 
 def _without_gaps(found, rates: list):
-    """Return the tangents of the whole result from the tangents of its numbers."""
+    """Return the tangents of all arrays of `found`: `rates` of the real ones, zeros for integers."""
     left = iter(rates)
     return jax.tree.map(
         lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found

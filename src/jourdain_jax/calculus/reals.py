@@ -55,8 +55,8 @@ def undecided(dtype: jnp.dtype) -> float:
     """Return the relative row size below which round-off decides the branch of a motion: 8 sqrt(eps) of
     `dtype`.
 
-    Round-off e turns two crossing branches of g = 0 into the hyperbola g = e. At a distance of about sqrt(e)
-    from the crossing, it leads from one branch to the other.
+    Round-off e turns two crossing branches of g = 0 into the hyperbola g = e. Within about sqrt(e) of the
+    crossing, a motion on the hyperbola passes from one branch to the other.
     """
     return 8 * float(jnp.finfo(dtype).eps) ** 0.5
 

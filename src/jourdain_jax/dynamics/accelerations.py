@@ -109,8 +109,8 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
     if not valid or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
         raise ValueError(
-            f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its "
-            "name"
+            f"`independent` is {chosen}, expected indices of {where}, each once; or give the reduction "
+            "by its name"
         )
     return reduction
 

@@ -1,5 +1,5 @@
-"""Kinematics of switching contacts, and of constraints that hold up to a force: gaps, speeds, and
-derivatives.
+"""Kinematics of switching contacts, and of constraints that hold until their force exceeds a limit: gaps,
+speeds, and derivatives.
 
     w = (dg/dt, slip along the tangents)    of each contact with gap g
     w = A u + a,   dw/dt = A udot + drift
@@ -32,7 +32,7 @@ class ContactRows(eqx.Module):
 
 
 class SwitchingRow(NamedTuple):
-    """A contact with friction, or a constraint that holds up to a force, for the laws of contact."""
+    """A contact with friction, or a constraint that holds until its force exceeds a limit."""
 
     friction: Coulomb
     slip: Float[Array, "2"]  # m/s or rad/s
@@ -54,7 +54,7 @@ class SwitchingRow(NamedTuple):
 
 
 def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
-    """Return the contacts with friction and the constraints that hold up to a force, in the order of their
+    """Return the contacts with friction and the constraints with a limit of force, in the order of their
     modes.
     """
     contacts = contacts_of(scene, motion.pose())
@@ -67,7 +67,7 @@ def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
 
 
 def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
-    """Return the gaps of switching contacts, in m; zero for constraints that hold up to a force."""
+    """Return the gaps of switching contacts, in m; zero for constraints."""
     contacts = contacts_of(scene, pose)
     names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
     return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
@@ -98,8 +98,8 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
-    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints that hold up
-    to a force give the forces A' L on the speeds.
+    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a limit
+    of force give the forces A' L on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

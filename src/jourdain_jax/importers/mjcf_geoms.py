@@ -44,7 +44,8 @@ class GeomReader:
         self.unit = 1.0 if self.settings["angle"] == "radian" else math.pi / 180
         if len(self.settings["eulerseq"]) != 3 or set(self.settings["eulerseq"].lower()) - set("xyz"):
             raise compiler.fault(
-                "`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters out of x, y, z, X, Y, Z"
+                "`eulerseq`",
+                f"`{self.settings['eulerseq']}`, expected three letters, each one of x, y, z, X, Y, Z",
             )
         self.meshes = {
             mesh.get("name") or Path(mesh.get("file", "")).stem: mesh

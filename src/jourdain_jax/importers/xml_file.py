@@ -186,8 +186,8 @@ def _parsed(content: str | bytes, source: str) -> Element:
 
 
 class Part:
-    """An element during reading: its attributes and children, and its name in messages; `element` is None if
-    it is missing.
+    """An XML element during reading: its attributes, its children and its name `what` in messages. `element`
+    is None if the file lacks it.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Projection of coordinates or of speeds onto the constraints, by machine code if possible, otherwise by XLA.
 XLA also computes the derivatives.
 
-With machine code, constraints and mass matrix are functions that JAX can differentiate: a derivative contains
-two calls instead of the traced scene.
+JAX can differentiate constraints and mass matrix that machine code evaluates: the derivative consists of two
+calls of machine code.
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
     d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs

@@ -53,7 +53,9 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return at which knots steps must end, if lines may miss samples by at most `share` of their range."""
+    """Return whether steps must end at each sample, so that straight lines between such samples deviate from
+    the others by at most `share` of the range of values.
+    """
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 

@@ -111,7 +111,9 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes except the last `but` (1 or 3); on a GPU, from the host."""
+    """Return the product of the sizes of all axes except the last `but` (1 or 3). The host computes it for a
+    GPU, which loads it.
+    """
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
     total = w.room(type="i64")

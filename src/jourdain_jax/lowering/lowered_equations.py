@@ -178,9 +178,9 @@ class Lowered:
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return the results of `rates`, the pivots, the directions of constraints, and the smallest sine
-        between a constraint with multiplier and the earlier ones (None without multipliers). Pivots must keep
-        their signs. Only the rates have derivatives.
+        """Return the results of `rates`, the pivots, the directions of constraints, and the sine of the
+        smallest angle of a constraint with multiplier to the span of those before it (None without
+        multipliers). Pivots must keep their signs. Only the rates have derivatives.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """

@@ -102,7 +102,7 @@ def where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
 
 
 def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[NodeList, NodeList]:
-    """Return the outputs for a positive and for a negative number of these relations (from `switches`)."""
+    """Return the outputs above and below the zero of the number that decides the relations `nodes`."""
     outputs = list(outputs)
     above, below = (
         graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes})

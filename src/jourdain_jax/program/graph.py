@@ -269,7 +269,7 @@ class Graph:
         return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> NodeList:
-        """Return the results of a call with these indices, shapes and types."""
+        """Return nodes for results of a call. `shapes`: index of a result -> its shape and type."""
         return [self._node("output", (call,), (k, *shape)) for k, shape in shapes.items()]
 
     def entries(self, output: int) -> np.ndarray:
@@ -292,7 +292,7 @@ class Graph:
         return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
 
     def copied(self, nodes: Iterable[int], of: "Graph", known: Mapping[int, int]) -> dict[int, int]:
-        """Copy nodes from another graph; return old -> new node, including the `known` ones."""
+        """Return a dictionary, node of another graph -> its copy; `known` has copies that exist already."""
         nodes, new = list(nodes), dict(known)
         for node in of.needed(nodes, new):
             new[node] = (

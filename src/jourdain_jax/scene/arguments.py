@@ -233,7 +233,7 @@ def warn(text: str, kind: type[Warning] = UserWarning) -> None:
 
 
 def _is_shortened(error: BaseException) -> bool:
-    """Return whether the traceback contains a user's line. If so, add the note to the error."""
+    """Return whether the traceback contains a user's line. If so, add to the error how to see all lines."""
     if jax.config.jax_traceback_filtering == "off":
         return False
     if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):

@@ -74,9 +74,9 @@ def modes(**values) -> Modes:
 class Event:
     """An event after which the motion continues. `events` returns it in place of a plain value.
 
-    - `value`: the event occurs where it falls through zero. A smooth dip of an event narrower than the
-      longest step may be missed, as may a condition such as `jnp.linalg.norm(x) < r` that holds for less than
-      that. Use values that fall only once, or a smaller `max_step`.
+    - `value`: the event occurs where it falls through zero. A smooth dip of an event's value, if shorter than
+      the longest step, may be missed. So may a condition such as `jnp.linalg.norm(x) < r` that holds for less
+      time. Use values that fall only once, or a smaller `max_step`.
     - `to`: mode -> name of its value afterwards.
     - `jump`: coordinate or speed -> its value afterwards; the other ones do not jump. The new state must
       satisfy the velocity constraints.

@@ -128,7 +128,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 
 def is_function(x) -> bool:
-    """Return whether x is a function, which may read names, and not a module with numbers."""
+    """Return whether x has code that may read names: a function, a method, or what wraps one."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(attribute(x, "__wrapped__"))
 
 

@@ -183,8 +183,8 @@ class Scene(eqx.Module):
         one step. Such an event is found if a relation in it (`<`, `where`, `abs`, ...) changes. Default
         solvers also find it if the cubic through values and rates at the ends of the step is negative. Other
         adaptive solvers find it if the dense output is negative at one of three times. Otherwise a smooth dip
-        of an event narrower than the longest step may be missed, as may a condition such as
-        `jnp.linalg.norm(x) < r` that holds for less than that. Use values that fall only once, or a smaller
+        of an event's value, if shorter than the longest step, may be missed. So may a condition such as
+        `jnp.linalg.norm(x) < r` that holds for less time. Use values that fall only once, or a smaller
         `max_step`.
         """
         return {}

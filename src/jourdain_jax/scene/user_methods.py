@@ -58,7 +58,7 @@ def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
     if not isinstance(given, Iterable) or isinstance(given, dict | str):
         raise ValueError(
             f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of "
-            "loads; write return (jj.gravity(motion, 9.81),)"
+            "loads; write `return (jj.gravity(motion, 9.81),)`"
         )
     return tuple(_checked_load(scene, i, load) for i, load in enumerate(given))
 
@@ -132,7 +132,7 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
 
 
 def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
-    """Return the velocity constraints that hold up to a force, by name."""
+    """Return the velocity constraints that hold until their force exceeds a limit, by name."""
     if not scene.switching.rows:
         return {}
     return held_rows(scene.velocity_constraints(motion), loads_of(scene, motion))
@@ -225,7 +225,7 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
     if not isinstance(given, dict):
         raise ValueError(
             f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary "
-            f"by name; write return {example}"
+            f"by name; write `return {example}`"
         )
     for name in given:
         if not isinstance(name, str):

@@ -318,8 +318,8 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether any number has a fault. `stacked`: kind -> numbers, with axes of states and of
-    owners.
+    """Return whether any number has a fault. `stacked`: kind -> numbers, with axes of states and of the
+    bodies or contacts that have them.
     """
     found = [
         check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked

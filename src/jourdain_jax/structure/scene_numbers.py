@@ -113,13 +113,13 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
 
 
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
-    """Return velocities (m/s) of the ground of every contact.
+    """Return numbers on the motion of the ground of every contact.
 
-    - "plane": two velocities of the contact's plane along its normal, by `origin` and `tilt` and by
-      `velocity` and `angular_velocity`, and the sum of the sizes of their terms.
+    - "plane": two velocities (m/s) of the contact's plane along its normal: by rates of `origin` and `tilt`,
+      and by the stated `velocity` and `angular_velocity`. Third: the sum of the sizes of all terms.
     - "own plane": the same for a `Contact` with a user-defined point.
-    - "ground": the rates of all numbers of the ground due to the motion of other bodies, relative to the
-      speeds of these, and the ground's stated velocity.
+    - "ground": the size of the rates of the ground's numbers if only other bodies move, over the size of
+      the speeds of these; and the size of the ground's stated velocity.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())

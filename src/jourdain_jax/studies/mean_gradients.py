@@ -1,14 +1,14 @@
 """Gradients of the means of a study's outputs, by the pathwise derivative.
 
-Sample k has the probabilities u_k, independent of the distributions. With the varying quantities x_k(theta)
-and the output f as a function of them,
+Sample k consists of probabilities u_k, from which the distributions, with numbers theta, give its varying
+quantities x_k(theta). The u_k do not depend on theta. With the output f as a function of x,
 
     d mean / d theta = (1 / n) sum_k  df/dx (x_k)  dx_k / d theta
 
 where df/dx is the exact derivative of the sample's motion, in forward mode. This is the derivative of the
 mean if f is continuous. f may jump where the end of a motion changes, for example from an event to none. The
-contribution of these samples is missing then, with a warning. Outputs that depend only on the event that
-happened have no pathwise derivative.
+derivative then lacks the contribution of the jumps, and a warning says so. Outputs that depend only on the
+event that happened have no pathwise derivative.
 """
 
 from collections.abc import Mapping, Sequence

@@ -108,7 +108,7 @@ class StudyResult(Printed):
         if self.task is None:
             raise ValueError(
                 "the scene of this study is unknown here; call `study.run` with the same arguments, which "
-                "computes nothing again"
+                "reads the stored samples"
             )
         kept = {}
         if self.store.columns:

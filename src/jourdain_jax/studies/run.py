@@ -202,8 +202,8 @@ def _chunk(task: Task, chunk: int | None) -> int:
         return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
         raise ValueError(
-            f"`chunk` is {chunk!r}, expected a multiple of {unit} samples, such as {4 * unit}: this study "
-            "computes so many together"
+            f"`chunk` is {chunk!r}, expected a multiple of {unit}, such as {4 * unit}: this study "
+            f"computes {unit} samples together"
         )
     return int(chunk)
 

@@ -90,8 +90,8 @@ def stability_chart(
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
         raise ValueError(
-            f"`prior` is {given}, expected `jj.studies.Normal(mean, sigma)` for each name, a parameter that"
-            " is one number"
+            f"`prior` is {given}, expected names of parameters of one number, each with "
+            "`jj.studies.Normal(mean, sigma)`"
         ) from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []

@@ -1,4 +1,4 @@
-"""Eigenvalues of small motions about the points of a family, each in one column along the whole curve."""
+"""Eigenvalues of small motions about the points of a family; a column follows one along the curve."""
 
 import numpy as np
 from jaxtyping import Complex, Float

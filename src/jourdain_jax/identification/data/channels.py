@@ -219,8 +219,8 @@ class LoadCell(Instrument):
         self.contact = contact
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """Raise ValueError, naming the `channel` and the run (`where`), if the scene has no such contact or
-        its force is not determined.
+        """Raise ValueError if the scene has no such contact or its force is not determined. The message names
+        the `channel` and the run (`where`).
         """
         determined = _determined(scene)
         what = f"the load cell `{channel}` of {where} is under contact `{self.contact}`"

@@ -142,7 +142,7 @@ def unbounded(scale: Number | None = None) -> Range:
     number = float(checked_known(scale, "`scale` of `unbounded`", ()))
     if not (np.isfinite(number) and number > 0):
         raise ValueError(
-            f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown"
+            f"unbounded({scale}): expected a positive scale, the typical change of the unknown in its unit"
         )
     return Range("unbounded", scale=number)
 

@@ -63,8 +63,9 @@ class Reading(Response):
     def shown(
         self, x, grid, ts, begin=None
     ) -> tuple[Float[Array, "times *channel"], Float[Entries, "grid entries"] | None]:
-        """Return the reading at `ts` of a quantity with values `x` at these times or on a grid, and the
-        output of the filter on the grid. `begin`: its initial output (None: its steady value).
+        """Return the reading at the times `ts`, and the output of the filter on the grid (None without a
+        grid). `x`: the quantity on the grid, or at `ts`; `begin`: initial output of the filter (None: its
+        steady value).
         """
         y = None
         if grid is not None:

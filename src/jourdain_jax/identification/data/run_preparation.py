@@ -156,7 +156,7 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
         )
         raise ValueError(
             f"input `{name}` of {where} is sampled from {first} to {last} s, but the run is from {begin} to "
-            f"{end} s, where the input would be constant; take both from one clock, or give a number"
+            f"{end} s; take both from one clock, or give a number for a constant input"
         )
 
 

@@ -100,8 +100,8 @@ class Chains:
         return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
     def at(self, places: np.ndarray, members: np.ndarray, taus: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of preceding samples, and rho, for pairs of a run (`places`) and a member; estimated
-        correlation times have shape (pairs, channels).
+        """Return, for pairs of a run (`places`) and a member, the index of each sample's predecessor, and
+        their correlation rho. `taus`: estimated correlation times, s, (pairs, channels).
         """
         tau = self.known[places].copy()
         for where, value in zip(self.unknown, taus.T, strict=True):

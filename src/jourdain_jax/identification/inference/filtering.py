@@ -240,7 +240,7 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
             if isinstance(reading.operation, StopEvent):
                 raise ValueError(
                     f"run {index} gives the time of its event `{name}`, which the filter does "
-                    "not use; omit it, and the samples after it"
+                    "not use; omit this time, and the samples after it"
                 )
             which = f"sensor `{name}` of run {index}"
             if reading.is_late:

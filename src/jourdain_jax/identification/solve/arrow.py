@@ -253,7 +253,7 @@ def by_singular_values(
     shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float
 ) -> Float[np.ndarray, "members shared"]:
     """Return the damped step ds of the shared unknowns: (S^2 + lambda) V' D ds = - S U' c, zero in
-    undetermined directions. U S V': the columns of `shared` over D; c: its residuals.
+    undetermined directions. `shared` is [J, c], with residuals c; U S V' = J D^-1.
     """
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest

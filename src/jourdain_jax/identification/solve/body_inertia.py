@@ -170,8 +170,9 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
         )
         raise ValueError(
             f"no body of nonzero thickness has the moments of inertia of body `{name}` of "
-            f"`{type(scene).__name__}`, {moments} kg m^2 with its products: principal moments must be "
-            "positive, each less than the sum of the other two; for a flat body, reduce the largest slightly"
+            f"`{type(scene).__name__}`, {moments} kg m^2, and its products of inertia: principal moments "
+            "must be positive, each less than the sum of the other two; for a flat body, reduce the largest "
+            "slightly"
         )
     return found
 

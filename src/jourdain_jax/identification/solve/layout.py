@@ -72,7 +72,7 @@ class Layout:
 
     @property
     def following(self) -> Labels:
-        """Return names of the dependent parameters: moments of inertia of bodies, and tied ones."""
+        """Return names of parameters that follow from unknowns: of inertias of bodies, and tied ones."""
         names = [entry.name for body in self.bodies for entry in body.entries]
         return tuple(dict.fromkeys([*names, *(tie.name for tie in self.ties)]))
 

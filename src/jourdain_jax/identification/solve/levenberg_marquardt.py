@@ -119,7 +119,7 @@ class Minimum(ByMember):
         return found
 
     def continued(self, members: Members, new: "Minimum") -> "Minimum":
-        """Return all members, with the results of a continued minimisation for these; steps add up."""
+        """Return all members. `members` get the results of `new`, which began at theirs; steps add up."""
         return self.replaced(members, new.after(self, members), np.ones(len(members), bool))
 
     def after(self, before: "Minimum", members: Members) -> "Minimum":

@@ -186,8 +186,8 @@ class Problem:
     def joined(
         self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None
     ) -> tuple[Arrow, np.ndarray | float]:
-        """Return the arrow matrix for triangles (members, runs, kinds, width, width), these sigmas (members,
-        kinds) and all priors; and the contribution of the priors to F.
+        """Return the arrow matrix of all runs and priors, and the contribution of the priors to F.
+        `triangles` (members, runs, kinds, width, width) are divided by `sigma` (members, kinds).
         """
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]

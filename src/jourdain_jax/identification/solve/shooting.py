@@ -110,7 +110,7 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> E
     if run.ended_by:
         raise ValueError(
             f"run {index} has a measured time of its event `{run.ended_by}`, which `shooting` does not use; "
-            "omit it, and the samples after it"
+            "omit this time, and the samples after it"
         )
     ts = np.asarray(run.ts)
     count = len(ts) - 1

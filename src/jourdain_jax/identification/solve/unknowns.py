@@ -190,7 +190,7 @@ def unknowns_of(
     if all(entry.fixed for entry in entries):
         raise ValueError(
             "nothing is free; name parameters in `free` "
-            f"({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run"
+            f"({', '.join(f'`{name}`' for name in parameters)}), or start values in `unknown_start` of a run"
         )
     each = [entry for entry in entries for _ in range(entry.guess.size)]  # of each number
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
@@ -220,8 +220,8 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """Return a range that begins at zero, since the scene has no motion below zero, or slightly above if
-    `positive`. Raises ValueError for a negative guess.
+    """Return the unknown with a range from zero, or from slightly above it if `positive`: below zero, the
+    scene has no motion. Raises ValueError for a negative guess.
     """
     if np.any(entry.guess < 0):
         raise ValueError(

@@ -257,8 +257,8 @@ class Functions:
     def pull_reset(
         self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer
     ) -> None:
-        """Pull cotangents back through the state after an event. The cotangent of the event's time is added
-        after the arrays' cotangents.
+        """Pull cotangents back from the state after an event to the state before it. In `to_known`, the
+        cotangent of the event's time follows those of the arrays.
         """
         known = sum(self.sizes())
         of_state = lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]

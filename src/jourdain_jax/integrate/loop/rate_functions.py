@@ -7,8 +7,8 @@ cotangents:
     d f(t, y, p) = df/dy dy + df/dp dp          p: known numbers; those of `Form.moving` have tangents
     G_y = (df/dy)' g,   G_p += (df/dp)' g       g: cotangents of f; for the requested p
 
-Higher derivatives add the tangents of all these numbers along the next direction. Cotangents of a motion with
-its tangents give the second derivatives.
+A second derivative adds the tangents of all these numbers along a second direction. Cotangents of a motion
+with its tangents give the second derivatives.
 """
 
 from collections.abc import Sequence

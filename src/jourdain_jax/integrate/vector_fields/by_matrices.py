@@ -80,8 +80,8 @@ def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """Return the median size of the rates over probed states. For traced parameters it is a thousand times
-    larger, so that only much larger rates count as infinite.
+    """Return the size of the coordinate rates by each own speed, the median over probed states. A rate counts
+    as infinite far above this size, which is a thousand times larger for traced parameters.
     """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)

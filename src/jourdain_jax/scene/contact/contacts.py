@@ -106,7 +106,7 @@ class Contact(eqx.Module):
             advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
             raise ValueError(
                 f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a "
-                f"`jj.Plane(...)`, or None for z = 0 at rest{advice}"
+                f"`jj.Plane(...)`, or None for the resting plane z = 0{advice}"
             )
         if ground is not None:
             _checked_ground(ground, self.body)
@@ -256,8 +256,8 @@ def rolling(
     carried=None,
     **slips: Unpack[Slipping],
 ) -> Contact:
-    """Return the contact of a rolling `shape`, a function of its centre (m, inertial frame). Other arguments:
-    as in `ball_contact`.
+    """Return the contact of a rolling body. `shape`: function from the centre (m, inertial frame) to the
+    shape. Other arguments: as in `ball_contact`.
     """
     _checked_height(height)
     check_kind(body, BodyPose, "the body of a contact", 'the pose of a body; write pose["name"]')
@@ -281,7 +281,7 @@ def _checked_ground(given, body: str) -> Ground:
         known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
         raise ValueError(
             f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or "
-            "None for z = 0 at rest"
+            "None for the resting plane z = 0"
         )
     return given
 

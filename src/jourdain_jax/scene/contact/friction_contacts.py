@@ -1,8 +1,8 @@
 """Declarations that friction adds to a scene: a mode, three events and a direction of slip per contact.
 
 Which contacts have friction depends only on the structure of the scene, and is found once for each structure.
-Velocity constraints that hold up to a force count as contacts; "rolls" is then called "holds". For a contact
-`rim` the scene gets
+Velocity constraints that hold until their force exceeds a limit count as contacts; "rolls" is then called
+"holds". For a contact `rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`

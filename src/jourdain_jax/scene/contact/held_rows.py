@@ -1,5 +1,5 @@
-"""Velocity constraints that hold up to a maximum force: friction in joints, and blades that may slip
-sideways.
+"""Velocity constraints that hold until their force exceeds a limit: friction in joints, and blades that may
+slip sideways.
 
     w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        w: slip,  L: constraint force, N or N m
 
@@ -21,7 +21,7 @@ from jourdain_jax.scene.names import check_names
 
 
 class HeldRow(eqx.Module):
-    """A velocity constraint `w` = 0 (m/s or rad/s) that holds up to the forces of `friction` (N or N m)."""
+    """A velocity constraint `w` = 0 (m/s, rad/s) that holds until its force exceeds `friction` (N, N m)."""
 
     w: Scalar
     friction: Coulomb
@@ -38,7 +38,7 @@ class HeldRow(eqx.Module):
 
 
 class JointFriction(Load):
-    """Friction on speeds: constraints that hold up to a force, by name of the speed."""
+    """Friction on speeds: constraints that hold until their force exceeds a limit, by name of the speed."""
 
     rows: dict[str, HeldRow]
 
@@ -69,7 +69,7 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the constraints that hold up to a force, among results of `velocity_constraints` and `loads`."""
+    """Return the constraints with a limit of force, among results of `velocity_constraints` and `loads`."""
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}
