@@ -226,9 +226,7 @@ class Towed(OnPlane):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"formulation": jj.Formulation("full")}],
-    ids=["minimal", "full state"],
+    "options", [{}, {"formulation": jj.Formulation("full")}], ids=["minimal", "full state"]
 )
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     motion = jj.simulate(

@@ -214,9 +214,7 @@ def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_nu
 
 
 @pytest.mark.parametrize("precision", [jnp.float32, jnp.bfloat16])
-def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_double(
-    precision,
-):
+def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_double(precision):
     def end(rate):
         return jj.simulate(Slider(), {"x": 0.0}, ts=[1.0], inputs={"push": lambda t: rate * t}).q_end[0]
 

@@ -103,12 +103,7 @@ _matrices = compiled_quickly(_linearised)
 
 
 def eigenvalues(
-    M: Given,
-    C1: Given,
-    K0: Given,
-    K2: Given,
-    g: ArrayLike,
-    speeds: Float[ArrayLike, " speeds"],
+    M: Given, C1: Given, K0: Given, K2: Given, g: ArrayLike, speeds: Float[ArrayLike, " speeds"]
 ) -> Complex[Array, "speeds 4"]:
     """Return the four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
 
@@ -127,13 +122,7 @@ def eigenvalues(
 
 
 def stability_speeds(
-    M: Given,
-    C1: Given,
-    K0: Given,
-    K2: Given,
-    g: ArrayLike,
-    *,
-    max_speed: ArrayLike = 50.0,
+    M: Given, C1: Given, K0: Given, K2: Given, g: ArrayLike, *, max_speed: ArrayLike = 50.0
 ) -> StabilitySpeeds:
     """Return weave, capsize and double-root speed of one bicycle, differentiable in the matrices and g.
 
