@@ -219,26 +219,28 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
     """Return the motion with a mode and an event for each relation (`lowering/sides.py`), and with functions
     of time merged into its program.
     """
-    field, (_, scene, inputs, fixed, origin) = setup.field, begun.args
+    field, inputs = setup.field, begun.args[2]
     if _reason_against_sides(setup) or not isinstance(field, ByProgram):
         return setup, begun
     has_events = bool(setup.integrator.event_names)
     program, numbers = _relations(field.program, inputs, has_events)
     if not numbers:
         return setup, begun
-    if program is not field.program:
-        functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
-        fixed += tuple(
-            jnp.asarray(x, jnp.result_type(float)) for channel in functions for x in numbers_of(channel)
-        )
-        inputs = Inputs(
-            tuple(channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime))
-        )
-    program = with_sides(program, has_events, native_motion.modes_among(inputs))
-    inputs = Inputs((*inputs.channels, *[Mode(jnp.zeros(()))] * len(program.sides)))
+    merged = program is not field.program
+    kept = lambda inputs: [x for x in inputs.channels if not (merged and isinstance(x, FunctionOfTime))]
+    program = with_sides(program, has_events, native_motion.modes_among(Inputs(tuple(kept(inputs)))))
     field = replace(field, program=program, stops=program.stops)
-    setup = setup._replace(field=field, inputs=inputs)
-    return setup, eqx.tree_at(lambda b: b.args, begun, (field, scene, inputs, fixed, origin))
+
+    def within(args: tuple) -> tuple:
+        _, scene, inputs, fixed, origin = args
+        functions = [x for x in inputs.channels if merged and isinstance(x, FunctionOfTime)]
+        fixed += tuple(jnp.asarray(x, jnp.result_type(float)) for f in functions for x in numbers_of(f))
+        sides = [Mode(jnp.zeros(()))] * len(program.sides)
+        return field, scene, Inputs((*kept(inputs), *sides)), fixed, origin
+
+    args = within(begun.args)
+    plain = begun.plain and begun.plain._replace(args=within(begun.plain.args))
+    return setup._replace(field=field, inputs=args[2]), replace(begun, args=args, plain=plain)
 
 
 def reason_against_watching(setup: Setup) -> str:

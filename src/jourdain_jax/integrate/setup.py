@@ -176,7 +176,7 @@ class Plain(NamedTuple):
     """Numbers of a motion as given: without derivatives, without batch axis if all samples share them."""
 
     times: dict  # as in a `Setup`
-    known: tuple  # `native_motion.known_of`
+    args: tuple  # as in `Begun`, without the vector field and the scene
 
 
 class Begun(eqx.Module):

@@ -19,7 +19,7 @@ from jourdain_jax.calculus.reals import Count, Flag, Scalar, at_index, eps_of, i
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
 from jourdain_jax.integrate.inputs import Inputs, Mode, in_phases
-from jourdain_jax.integrate.loop import native_motion, value_kernels
+from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
@@ -115,8 +115,7 @@ def _plain(setup: Setup, timely: Flag) -> Plain:
     setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
     own = setup.fitting(timely)
     times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
-    args = setup.field, setup.scene, setup.inputs, setup.field.fixed(setup.scene), setup.t0
-    return Plain(times, tuple(native_motion.known_of(args)))
+    return Plain(times, (None, None, setup.inputs, setup.field.fixed(setup.scene), setup.t0))
 
 
 def _in_contact(setup: Setup) -> Setup:

@@ -201,7 +201,7 @@ def start_of(setup: Setup, begun: Begun) -> Start:
     # zeros for sampled inputs, which are interpolated
     known, plain = (
         tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
-        for part in (known_of(begun.args), begun.plain.known if begun.plain else ())
+        for part in (known_of(begun.args), known_of(begun.plain.args) if begun.plain else ())
     )
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
     samples, control = _samples(begun.args, goals, knots), control_of(setup, knots)
