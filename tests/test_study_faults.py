@@ -33,16 +33,7 @@ from test_studies import assert_same
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.scene.digests import digest
-from jourdain_jax.studies import (
-    End,
-    InUseError,
-    Uniform,
-    folder_lock,
-    manifest,
-    merge_studies,
-    store,
-    workers,
-)
+from jourdain_jax.studies import End, InUseError, Uniform, folder_lock, merge_studies, records, store, workers
 from jourdain_jax.studies.run import Runner, opened
 from jourdain_jax.studies.store import Store
 
@@ -101,7 +92,7 @@ def _after(monkeypatch, count, error):
             raise error
         write_whole(path, content, **how)
 
-    for module in (store, manifest):
+    for module in (store, records):
         monkeypatch.setattr(module, "write_whole", write)
 
 
@@ -312,8 +303,8 @@ def _changed(path, name, **entries):
     """
     file, listed = path / "run" / name, path / "run" / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | entries))
-    digests = json.loads(listed.read_text())["digests"] | {f"run/{name}": manifest.digest(file.read_bytes())}
-    manifest.write_manifest(path, digests)
+    digests = json.loads(listed.read_text())["digests"] | {f"run/{name}": records.digest(file.read_bytes())}
+    records.write_manifest(path, digests)
 
 
 def test_another_format_is_refused(path):

@@ -78,6 +78,7 @@ class Structure:
     odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
     odd_grounds: Labels  # grounds of contacts whose motion contradicts the stated one
     faults: Labels  # impossible bodies and planes, contradictory constraints; as sentences
+    without_inertia: Labels  # a free motion without inertia, as a sentence
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical, in scaled speeds
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in unscaled speeds
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric constraints
@@ -170,7 +171,8 @@ def structure_of(scene: Scene) -> Structure:
     """
     structure = structure_whatever_its_faults(scene)
     # replaced parameters prove nothing about bodies and grounds
-    if wrong := structure.kinks or (is_judged(scene) and (structure.odd_grounds or structure.faults)):
+    of_numbers = structure.odd_grounds or structure.faults if is_judged(scene) else ()
+    if wrong := structure.without_inertia or structure.kinks or of_numbers:
         raise ValueError(wrong[0])
     return structure
 
@@ -252,7 +254,7 @@ def _probed_structure(scene: Scene) -> Structure:
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     # a negative mass is another fault
-    faults = faults or no_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
+    inert = () if faults else no_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
     by_user = scene.privileged
@@ -324,6 +326,7 @@ def _probed_structure(scene: Scene) -> Structure:
         odd_bodies=bodies,
         odd_grounds=grounds,
         faults=faults,
+        without_inertia=inert,
         row_lengths=typical,
         plain_row_lengths=typical_row_lengths(found.A[generic], beyond),
         times=t,
