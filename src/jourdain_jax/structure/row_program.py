@@ -21,7 +21,14 @@ from jourdain_jax.program.subgraph import part_of
 from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
 from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.plausibility import BY_ROWS, CHECKS, any_wrong, elsewhere, without_inertia
+from jourdain_jax.structure.plausibility import (
+    BY_ROWS,
+    CHECKS,
+    any_wrong,
+    checks_inertia,
+    elsewhere,
+    without_inertia,
+)
 from jourdain_jax.structure.probes import LookedAt, looked_at
 
 Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
@@ -134,7 +141,11 @@ def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple
 
 
 def _may_vanish(scene: Scene, looked: LookedAt) -> bool:
-    """Return whether a mass or inertia depends on a parameter that may be zero."""
+    """Return whether a mass or inertia depends on a parameter that may be zero; False for scenes too large
+    for the check.
+    """
+    if not checks_inertia(scene):
+        return False
     positive = {f.name for f in fields(scene) if f.metadata.get("positive")}
     leaves = zip(jax.tree_util.tree_leaves_with_path(scene), looked.traced.parameters, strict=True)
     others = [n for (path, _), leaf in leaves if path[0].name not in positive for n in leaf.ravel().tolist()]
