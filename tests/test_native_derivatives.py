@@ -75,7 +75,7 @@ LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(derivative):
-    x = LANES.at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
+    x = jnp.asarray(LANES).at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
     found = {}
     for backend in ("native", "xla"):  # 20 steps are enough for some
         slope = derivative(lambda x, backend=backend: jnp.sum(_ends(x, backend, True, max_steps=20)[:4]))
@@ -110,7 +110,9 @@ def test_derivatives_pass_through_motions_one_after_the_other(derivative):
         return jnp.concatenate([state.q, state.u])
 
     found = derivative(late)(X[1])
-    assert_allclose(found, jax.jit(jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4]))(X[1]), rtol=1e-8)
+    assert_allclose(
+        found, jax.jit(jax.jacfwd(lambda k: _exact(jnp.asarray(X).at[1].set(k))[2:4]))(X[1]), rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
