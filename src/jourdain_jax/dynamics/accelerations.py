@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, check_kind, checked_real, largest
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, check_kind, checked_real, eps_of, largest
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
     Multipliers,
@@ -24,7 +24,7 @@ from jourdain_jax.equations.reductions import (
     smallest_that_counts,
 )
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
-from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import (
@@ -63,6 +63,8 @@ class Accelerations(eqx.Module):
     udot: Speeds
     # lambda of minimum norm: the constraint force on the speeds is A' lambda
     multipliers: Float[Array, "rows"]
+    # columns with A' lambda = 0, which do not affect the motion; a row whose multiplier is unique has zeros
+    spare: Float[Array, "rows rows"]
     constraint_force: Speeds  # A' lambda = M udot + h - Q
     rank: Count  # of A at this state
     # of scaled A, the last one within its usual rank (1 without constraints), or a smaller pivot of the
@@ -72,6 +74,9 @@ class Accelerations(eqx.Module):
     applicable: Flag  # whether this reduction works at this state
 
 
+_SHORT_NAMES = "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"
+
+
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
     """Return all reductions by short name: "privileged", "qr", "svd", "kkt", "udwadia-kalaba",
     "gibbs-appell".
@@ -79,14 +84,8 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
     "privileged" and "gibbs-appell" use the scene's privileged velocities.
     """
     independent = structure_of(as_scene(scene)).independent
-    return {
-        "privileged": Privileged(independent),
-        "qr": NullSpaceQR(),
-        "svd": NullSpaceSVD(),
-        "kkt": Multipliers(),
-        "udwadia-kalaba": UdwadiaKalaba(),
-        "gibbs-appell": GibbsAppell(independent),
-    }
+    by_name = Privileged(independent), NullSpaceQR(), NullSpaceSVD(), Multipliers(), UdwadiaKalaba()
+    return dict(zip(_SHORT_NAMES, (*by_name, GibbsAppell(independent)), strict=True))
 
 
 def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
@@ -101,7 +100,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         reduction,
         Reduction | GibbsAppell,
         "`reduction`",
-        f"a name ({', '.join(reductions(scene))}) or an object such as `jj.equations.NullSpaceQR()`",
+        f"a name ({', '.join(_SHORT_NAMES)}) or an object such as `jj.equations.NullSpaceQR()`",
     )
     chosen = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else ()
     count = len(scene.speed_names)
@@ -170,6 +169,7 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
     return Accelerations(
         udot=found.udot,
         multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
+        spare=_spare_multipliers(problem),
         constraint_force=found.constraint_force,
         rank=numerical_rank(sigma),
         smallest_singular_value=jax.lax.stop_gradient(
@@ -178,6 +178,12 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
         residual=largest(problem.d * (rows.A @ found.udot + rows.drift)),
         applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
     )
+
+
+def _spare_multipliers(problem: ScaledProblem) -> Float[Array, "rows rows"]:
+    A = jax.lax.stop_gradient(problem.A)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
+    return problem.d[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(eps_of(A)), spare, 0.0)
 
 
 def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced:

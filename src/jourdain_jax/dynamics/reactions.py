@@ -11,17 +11,14 @@ all bodies. Everything is in the inertial frame. Source: Wang and Pao (2003), eq
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Flag, Scalar, eps_of, largest, rank_cutoff, static
+from jourdain_jax.calculus.reals import Flag, Scalar, largest, rank_cutoff, static
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies
-from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
-from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.rows import flatten_rows, velocity_rows
 from jourdain_jax.equations.scene_parts import names_of_rows
 from jourdain_jax.equations.virtual_power import contact_response, resultants, switching_forces
 from jourdain_jax.program.eager import eager_if_concrete
@@ -30,7 +27,6 @@ from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels, Named, UnknownNameError, check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import contacts_of
-from jourdain_jax.structure.structure import plain_row_lengths
 
 
 class RowReactions(eqx.Module):
@@ -78,13 +74,15 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
     Their generalized forces `sum_s beta' R^s + gamma' T^s + direct^s` sum to `A' lambda`.
     """
     motion = motion_at(scene, t, q, u, inputs)
-    return _reactions(scene, motion, _per_multiplier(scene, motion, inputs), accelerations.multipliers)
+    return _reactions(scene, motion, _per_multiplier(scene, motion), accelerations)
 
 
-def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowReactions:
-    on_bodies, direct, spare = unit
+def _reactions(scene: Scene, motion: Motion, unit: tuple, found: Accelerations) -> RowReactions:
+    (on_bodies, direct), multipliers = unit, found.multipliers
     force, torque = (multipliers[:, None, None] * part for part in (on_bodies.force, on_bodies.torque))
-    determined = jnp.diagonal(spare) == 0  # a multiplier is unique if its row is no combination of the others
+    determined = (
+        jnp.diagonal(found.spare) == 0
+    )  # a multiplier is unique if its row is no combination of the others
     return RowReactions(
         multipliers,
         force,
@@ -96,24 +94,21 @@ def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowRea
     )
 
 
-def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
-    """Return forces on bodies and on speeds for a unit multiplier of each row (first axis), and the result of
-    `_spare_multipliers`.
-    """
-    bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
+def _per_multiplier(scene: Scene, motion: Motion) -> tuple[Wrenches, Array]:
+    """Return forces on bodies and on speeds for a unit multiplier of each row (first axis)."""
+    bodies, u = motion.bodies.values(), motion.u.array
     if not names_of_rows(scene):
-        nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
-        return Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype)
+        nothing = jnp.zeros((0, len(bodies), 3), u.dtype)
+        return Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), u.dtype)
 
     def rows(v, omega, u):
-        return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
+        return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), u.dtype)
 
     v, omega = of_bodies(motion, "velocity"), of_bodies(motion, "angular_velocity")
     force, torque, direct = jax.jacrev(rows, argnums=(0, 1, 2))(v, omega, u)
     rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
     torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
-    A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
-    return Wrenches(force, torque), direct, _spare_multipliers(A, plain_row_lengths(scene))
+    return Wrenches(force, torque), direct
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -126,18 +121,6 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(
         motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies
     )
-
-
-def _spare_multipliers(
-    A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]
-) -> Float[Array, "rows rows"]:
-    """Return multipliers with `A' lambda = 0`, as columns. They do not affect the motion; independent rows
-    have none (zero). `typical`: typical lengths of the rows.
-    """
-    scale = row_scale(A, typical)
-    A = jax.lax.stop_gradient(scale[:, None] * A)
-    spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
-    return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(eps_of(A)), spare, 0.0)
 
 
 @eager_if_concrete
@@ -161,14 +144,14 @@ def contact_forces(
     contacts = contacts_of(scene, motion.pose())
     if not contacts:
         return {}
-    unit = _per_multiplier(scene, motion, inputs)
-    rows = _reactions(scene, motion, unit, accelerations.multipliers)
+    unit = _per_multiplier(scene, motion)
+    rows = _reactions(scene, motion, unit, accelerations)
     total = newton_residual(scene, t, q, u, accelerations.udot, inputs)
     size = _size_of_forces(scene, motion, total.linear)
     margin = rank_cutoff(size.dtype) * size
     # exerted by the choice of coordinates
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))
-    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit[2], part), unit[0])
+    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", accelerations.spare, part), unit[0])
     positions = of_bodies(motion, "position")
     rolling = {name: contact for name, contact in contacts.items() if contact.friction is None}
     built_in = normal_forces(rolling, rows.body_names, positions, held, spare, size)

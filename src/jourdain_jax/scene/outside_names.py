@@ -7,17 +7,15 @@ itself:
 
 - numbers, texts and tuples of them are compared by type and value, functions by the identity of the function
   and of its code. So `g = 1.62` in a later cell of a notebook, or `%autoreload`, takes effect;
-- modules, classes, and functions wrapped by Python, JAX or another package are compared by identity; their
-  attributes are constants;
+- modules, classes, and functions wrapped by Python, JAX or another package are compared by identity;
+  attributes of functions, modules and classes are constants;
 - arrays, containers and objects with state raise an error, since their changes could not be noticed.
 
 Values that helper functions read are not compared. After `clear_caches` every scene is traced again.
 """
 
-import enum
 import re
 from collections.abc import Callable, Hashable
-from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache, partial
@@ -168,18 +166,15 @@ def _content(x: Any) -> Hashable:
     """Return type and value of an object without state, or the identity of a module, class or function.
     Raises StatefulError for values that may change: arrays, containers, objects.
     """
-    own = getattr(x, "__dict__", None) or {}
-    if type(x) in _EXACTLY or isinstance(x, np.number | np.bool_ | np.dtype | PurePath):
+    bare = not hasattr(x, "__dict__")  # an object without attributes of its own
+    if type(x) in _EXACTLY or (bare and isinstance(x, np.number | np.bool_ | np.dtype | PurePath)):
         return type(x), repr(x)
     if isinstance(x, slice):
         parts = x.start, x.stop, x.step
     elif isinstance(x, partial):
         parts = x.func, x.args, *x.keywords.items()
-    elif isinstance(x, tuple | frozenset) and not own:
+    elif bare and isinstance(x, tuple | frozenset):
         parts = tuple(x)
-    elif isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
-        slots = fields(x) if is_dataclass(x) else ()
-        parts = *own.items(), *((field.name, getattr(x, field.name, None)) for field in slots)
     elif _is_constant(x):
         return _Same(x)
     else:

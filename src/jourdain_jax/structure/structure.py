@@ -187,11 +187,11 @@ def is_judged(scene: Scene) -> bool:
     return not is_traced(scene)
 
 
-def trust(scene: Scene) -> float:
-    """Return the weight of typical lengths: 1 for known parameters, 0.001 for traced parameters, whose values
-    may have another magnitude.
+def trust(scene: Scene, varied: bool = False) -> float:
+    """Return the weight of typical lengths: 1 for known parameters, 0.001 for traced or `varied` parameters,
+    whose values may have another magnitude.
     """
-    return 1.0 if is_judged(scene) else 1e-3
+    return 1.0 if is_judged(scene) and not varied else 1e-3
 
 
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
@@ -207,10 +207,12 @@ def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
     return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
 
 
-def usual_rows(scene: Scene) -> UsualRows:
-    """Return typical lengths of the rows in scaled speeds, and their rank at generic states."""
+def usual_rows(scene: Scene, varied: bool = False) -> UsualRows:
+    """Return typical lengths of the rows in scaled speeds, and their rank at generic states; for a batch
+    whose parameters are `varied`, from one sample `scene`.
+    """
     known = structure_whatever_its_faults(scene)
-    return UsualRows(known.row_lengths * trust(scene), np.asarray(known.rank, np.int32))
+    return UsualRows(known.row_lengths * trust(scene, varied), np.asarray(known.rank, np.int32))
 
 
 @once_per_values

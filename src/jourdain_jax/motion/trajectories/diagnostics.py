@@ -1,7 +1,6 @@
 """Diagnostics of a motion: drifts, residuals, conditioning, contact forces, and their printed summary."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,7 +12,7 @@ from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.integrate.inputs import Constant, Mode, Sampled
 from jourdain_jax.integrate.result_codes import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.integrate.vector_fields.field import reason_for_matrices
-from jourdain_jax.motion.trajectories.values_in_time import Checked, Checks, Record, map_over_times
+from jourdain_jax.motion.trajectories.values_in_time import Checked, Checks, Record, map_with_accelerations
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.structure.structure import structure_whatever_its_faults, usual_rows
 
@@ -92,8 +91,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
             f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
             "a rollout pass one lane: `rollout.lane(0)`"
         )
-    checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
-    return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
+    return _diagnosed(trajectory, map_with_accelerations(Checks, trajectory), _lacks_work(trajectory))
 
 
 DRIFTED = 1e-2  # of the varying energy

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -22,14 +21,13 @@ from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labels, values_in_time
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, lost_of, summary, warnings_of
 from jourdain_jax.motion.trajectories.sketch import sketch
-from jourdain_jax.motion.trajectories.values_in_time import Record, map_over_times
+from jourdain_jax.motion.trajectories.values_in_time import Record, map_over_times, map_with_accelerations
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import Labels, Sentences, UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import state_names
-from jourdain_jax.structure.structure import usual_rows
 
 
 class Trajectory(Record, Printed):
@@ -114,21 +112,19 @@ class Trajectory(Record, Printed):
 
     def accelerations(self) -> Accelerations:
         """Return accelerations, multipliers, rank and smallest singular value at all times."""
-        # samples of a batch differ in parameters
-        usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))
-        return map_over_times(values_in_time.AccelerationsBySvd(usual), self, by_inputs=True)
+        return map_with_accelerations(values_in_time.AccelerationsBySvd, self)
 
     def constraint_forces(self) -> RowReactions:
         """Return constraint forces per constraint and per body at all times, eqs. (68)-(70);
         `.forces_on("disc")` by constraint, in N, inertial frame.
         """
-        return map_over_times(values_in_time.reactions, self, by_inputs=True)
+        return map_with_accelerations(values_in_time.Reactions, self)
 
     def contact_forces(self) -> dict[str, ContactForce]:
         """Return, for every rolling contact at all times, the normal and tangential force (N) on the body and
         the friction coefficient that it needs.
         """
-        return map_over_times(values_in_time.contacts, self, by_inputs=True)
+        return map_with_accelerations(values_in_time.Contacts, self)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Return residuals of the geometric constraints (and quaternion norms), and of the

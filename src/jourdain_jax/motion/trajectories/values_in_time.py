@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.calculus.compilation import with_nan_as_a_mark, with_usual_promotion
 from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
-from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
+from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import NullSpaceSVD
@@ -26,7 +26,7 @@ from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import invariants_of
-from jourdain_jax.structure.structure import structure_whatever_its_faults
+from jourdain_jax.structure.structure import structure_whatever_its_faults, usual_rows
 
 
 class Phases(eqx.Module, Printed):
@@ -109,6 +109,17 @@ class Record(eqx.Module):
     event_names: Labels = static()
 
 
+def first_scene(record: Record) -> Scene:
+    """Return the scene of a motion, or of the first sample of a batch of motions."""
+    return at_index(record.scene, (0,) * (record.q.ndim - 2))
+
+
+def map_with_accelerations(f: type, record: Record):
+    """Evaluate `f(usual)`, a kind of `OfAccelerations`, at all times."""
+    usual = usual_rows(first_scene(record), varied=record.q.ndim > 2)
+    return map_over_times(f(jax.tree.map(jnp.asarray, usual)), record, by_inputs=True)
+
+
 @with_usual_promotion
 def map_over_times(f, record: Record, by_inputs: bool = False):
     """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at unreached times. f must be a named function
@@ -117,10 +128,11 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     `by_inputs`: whether f needs the rates of the inputs, because constraints depend on varying ones. For a
     batch of motions the batch axes come first.
     """
-    first = lambda: at_index(record.scene, (0,) * (record.q.ndim - 2))
     # accelerations depend on the rates of the inputs
     by_inputs = (
-        by_inputs and not record.inputs.constant and structure_whatever_its_faults(first()).rows_of_inputs
+        by_inputs
+        and not record.inputs.constant
+        and structure_whatever_its_faults(first_scene(record)).rows_of_inputs
     )
     known = not is_traced((f, record))
     # for one concrete motion NumPy finishes before a program is compiled (contact forces of a bicycle at
@@ -205,25 +217,35 @@ class InputOf(eqx.Module):
         return inputs[scene.inputs.entries.index(self.name)]
 
 
-class AccelerationsBySvd(eqx.Module):
-    """Accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint
-    rows, None: those of the scene.
-    """
+class OfAccelerations(eqx.Module):
+    """A quantity that depends on accelerations; `usual`: typical constraint rows."""
 
-    usual: UsualRows | None = None
+    usual: UsualRows
 
-    def __call__(self, scene, t, q, u, inputs) -> Accelerations:
+    def accelerations(self, scene, t, q, u, inputs) -> Accelerations:
+        """Return accelerations, multipliers, rank and smallest singular value."""
         return accelerations(scene, t, q, u, inputs, reduction=NullSpaceSVD(), usual=self.usual)
 
 
-def reactions(scene, t, q, u, inputs):
-    """Return the constraint forces per constraint and per body."""
-    return row_reactions(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
+class AccelerationsBySvd(OfAccelerations):
+    """Accelerations, multipliers, rank and smallest singular value."""
+
+    def __call__(self, scene, t, q, u, inputs) -> Accelerations:
+        return self.accelerations(scene, t, q, u, inputs)
 
 
-def contacts(scene, t, q, u, inputs):
-    """Return normal and tangential force and the friction coefficient needed, for every rolling contact."""
-    return contact_forces(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
+class Reactions(OfAccelerations):
+    """Constraint forces per constraint and per body."""
+
+    def __call__(self, scene, t, q, u, inputs) -> RowReactions:
+        return row_reactions(scene, t, q, u, self.accelerations(scene, t, q, u, inputs), inputs)
+
+
+class Contacts(OfAccelerations):
+    """Normal and tangential force and the friction coefficient needed, for every rolling contact."""
+
+    def __call__(self, scene, t, q, u, inputs) -> dict[str, ContactForce]:
+        return contact_forces(scene, t, q, u, self.accelerations(scene, t, q, u, inputs), inputs)
 
 
 def residuals(scene, t, q, u, inputs):
@@ -247,13 +269,11 @@ class Checked(NamedTuple):
     contacts: dict[str, ContactForce]
 
 
-class Checks(eqx.Module):
-    """`Checked` at one state; `usual`: typical constraint rows."""
-
-    usual: UsualRows
+class Checks(OfAccelerations):
+    """`Checked` at one state."""
 
     def __call__(self, scene, t, q, u, inputs) -> Checked:
-        found = AccelerationsBySvd(self.usual)(scene, t, q, u, inputs)
+        found = self.accelerations(scene, t, q, u, inputs)
         return Checked(
             energies(scene, t, q, u, inputs),
             residuals(scene, t, q, u, inputs),
