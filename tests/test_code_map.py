@@ -15,19 +15,19 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 471_339,
+    "code tokens of src": 471_739,
     "code tokens of docs": 11_517,
     "code tokens of notebooks": 7459,
     "caches": 49,
     "named numbers": 300,
-    "tests for a tracer": 58,
+    "tests for a tracer": 61,
     "functions with more than 8 parameters": 2,
     "ways: projection of a state onto its constraints": 3,
     "ways: the same within a step": 1,
     "ways: constraints and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, its event search and its adjoint": 1,
-    "code tokens of tests": 331_912,
+    "code tokens of tests": 332_132,
     "code tokens of bench": 107_655,
     "test files that reach private names": 34,
 }

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -143,6 +144,24 @@ def test_entries_at_places_are_those_of_jax(f):
     nodes = as_nodes(graph, found)
     values = Probes(graph, {str(k): np.array([float(k)]) for k in range(24)})(nodes.ravel().tolist())
     assert_array_equal(values.reshape(nodes.shape), f(jnp.asarray(x)))
+
+
+SQUARED = lambda x: x.at[1].apply(jnp.square)
+OF_NUMBERS = [SQUARED, lambda x: jnp.argmax(x, axis=1), lambda x: jnp.argmin(-x), lambda x: x.at[7].set(5.0)]
+
+
+@pytest.mark.parametrize("f", [*ENTRIES, *OF_NUMBERS])
+def test_numbers_at_places_are_those_of_jax(f):
+    x = np.arange(24.0).reshape(3, 4, 2)
+    x[1, 2, 0] = np.nan
+    assert_array_equal(uncompiled_lanes(f, None)(x), f(jnp.asarray(x)))
+
+
+def test_entries_that_a_function_changes_have_no_scalar_form():
+    graph = Graph()
+    x = np.array([graph.input(str(k), True) for k in range(2)])
+    with pytest.raises(Unsupported, match="changed by a function"):
+        interpret(graph, jax.make_jaxpr(SQUARED)(np.zeros(2)), [Nodes(x)])
 
 
 def test_nothing_is_assumed_of_the_sign_of_a_parameter():

@@ -272,8 +272,12 @@ def tiny_of(x):
 
 
 def at_index(tree, index):
-    """Return the tree with `x[index]` for each array `x`."""
-    return jax.tree.map(lambda x: x[index], tree)
+    """Return the tree with `x[index]` for each array `x`. In this machine's memory NumPy reads it, for which
+    JAX would compile two programs for each shape.
+    """
+    known = not is_traced((tree, index))
+    here = lambda x: known and isinstance(x, jax.Array) and {d.platform for d in x.devices()} == {"cpu"}
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]) if here(x) else x[index], tree)
 
 
 def array_module(x) -> ModuleType:

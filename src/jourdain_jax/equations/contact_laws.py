@@ -93,6 +93,7 @@ def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) ->
     return jnp.stack([found[row] for row in range(len(K))])
 
 
+@jax.jit  # traced once
 def responses(
     G: Float[Array, "rows rows"],
     b: Float[Array, "rows columns"],

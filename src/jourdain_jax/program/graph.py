@@ -22,6 +22,7 @@ ARRAYS = {"array", "opaque", "output"}  # operations whose values are not scalar
 NodeList = list[int]  # node indices
 _GROWING = threading.Lock()  # lock, because threads may extend one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # included in operation counts
+ARITHMETIC = {"add", "sub", "mul", "div", "neg"}  # methods of `Graph`
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
@@ -234,7 +235,7 @@ class Graph:
 
     def call(self, op: str, *args: int) -> int:
         """Return a function of scalars by name; a constant if all arguments are constants."""
-        if op in _ARITHMETIC:
+        if op in ARITHMETIC:
             return getattr(self, op)(*args)
         if all(self.op[a] == "const" for a in args):
             with np.errstate(all="ignore"):
@@ -387,6 +388,3 @@ class Graph:
     def operations(self, outputs: Iterable[int]) -> int:
         """Return the number of operations on varying quantities."""
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
-
-
-_ARITHMETIC = {"add", "sub", "mul", "div", "neg"}

@@ -20,8 +20,8 @@ from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
-from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.numpy_backend import applied, gathered, places
+from jourdain_jax.program.graph import ARITHMETIC, Graph, Unsupported
+from jourdain_jax.program.numpy_backend import applied, gathered, scattered, targets
 
 _LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # piecewise linear, with the derivative of each piece
 _HOME = f"{Path(__file__).parent.parent}{os.sep}"  # folder of this package
@@ -76,7 +76,7 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
     """Return the results of one equation."""
     name = equation.primitive.name
     refuse(equation)
-    symbolic = any(isinstance(x, Nodes) for x in inputs)
+    symbolic = Nodes in map(type, inputs)
     if graph.keeps_rules and symbolic and (rule := own_rule(name, equation.params)):
         raise Unsupported(rule)
     inner = called(name, equation.params)
@@ -86,7 +86,7 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
         return interpret(graph, equation.params["branches"][int(inputs[0])], inputs[1:])
     if name == "cond":
         found = [interpret(graph, branch, inputs[1:]) for branch in equation.params["branches"]]
-        choose = partial(_elementwise, graph, partial(_select, graph, {}))
+        choose = partial(_elementwise, graph, partial(_select, graph))
         return [Nodes(choose([inputs[0], *cases])) for cases in zip(*found, strict=True)]
     if not equation.outvars:
         raise Unsupported(f"the operation `{name}`")
@@ -111,7 +111,7 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
         first, (axis,) = partial(_first_true, graph), equation.params["axes"]
         return [Nodes(np.apply_along_axis(first, axis, as_nodes(graph, inputs[0])))]
     if name in _ELEMENTWISE:
-        return [Nodes(_elementwise(graph, partial(_ELEMENTWISE[name], graph, equation.params), inputs))]
+        return [Nodes(_elementwise(graph, _ELEMENTWISE[name](graph, equation.params), inputs))]
     raise Unsupported(f"the operation `{name}`")
 
 
@@ -119,18 +119,19 @@ def _elementwise(graph: Graph, result: Callable, inputs: Sequence[Value]) -> np.
     arrays = [as_nodes(graph, x) for x in inputs]
     if any(a.shape != arrays[0].shape for a in arrays):
         arrays = np.broadcast_arrays(*arrays)
-    found = [result(*entries) for entries in zip(*(a.ravel().tolist() for a in arrays), strict=True)]
+    found = list(map(result, *(a.ravel().tolist() for a in arrays)))
     return np.array(found, dtype=np.int64).reshape(arrays[0].shape)
 
 
 def refuse(equation) -> None:
     """Raise ValueError if a scene cannot contain this equation."""
-    kinds = [v.aval.dtype for v in (*equation.invars, *equation.outvars)]
-    if any(not isinstance(kind, np.dtype) and jnp.issubdtype(kind, jax.dtypes.prng_key) for kind in kinds):
-        raise ValueError(
-            f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
-            "them outside and pass them as parameters or inputs"
-        )
+    for v in (*equation.invars, *equation.outvars):
+        kind = v.aval.dtype
+        if not isinstance(kind, np.dtype) and jnp.issubdtype(kind, jax.dtypes.prng_key):
+            raise ValueError(
+                f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw "
+                "them outside and pass them as parameters or inputs"
+            )
 
 
 def own_rule(name: str, params) -> str:
@@ -167,27 +168,14 @@ def _gather(graph, inputs, params):
     return found
 
 
-def _targets(inputs, params) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat places that a scatter changes, and the entries that it takes there."""
-    x, indices, update = inputs
-    n, count = params["dimension_numbers"], indices.ndim - 1
-    moved = np.moveaxis(update, n.update_window_dims, range(count, update.ndim))
-    window = iter(moved.shape[count:])
-    alone = (*n.inserted_window_dims, *n.operand_batching_dims)
-    sizes = [1 if axis in alone else next(window) for axis in range(x.ndim)]
-    lanes = zip(n.operand_batching_dims, n.scatter_indices_batching_dims, strict=True)
-    found = places(x.shape, indices, sizes, n.scatter_dims_to_operand_dims, lanes, params["mode"]).ravel()
-    return found[found >= 0], moved.ravel()[found >= 0]
-
-
 def _scatter(graph, inputs, params):
-    flat, (where, update) = inputs[0].flatten(), _targets(inputs, params)
-    flat[where] = update
-    return flat.reshape(inputs[0].shape)
+    if (found := scattered(params, *inputs)) is None:
+        raise Unsupported("entries changed by a function")
+    return found
 
 
 def _scatter_add(graph, inputs, params):
-    flat, (where, update) = inputs[0].flatten(), _targets(inputs, params)
+    flat, (where, update) = inputs[0].flatten(), targets(params, *inputs)
     if len(set(where.tolist())) != inputs[2].size:
         raise Unsupported("the operation `scatter-add` with repeated places")
     flat[where] = [graph.add(*pair) for pair in zip(flat[where].tolist(), update.tolist(), strict=True)]
@@ -226,7 +214,7 @@ _OF_NODES: dict[str, Callable] = {
 
 def _is_rounded(dtype: np.dtype) -> bool:
     """Return whether a type has lower precision than the program."""
-    return _kind(dtype) == "f" and dtype.itemsize < real_type().itemsize
+    return dtype != np.float64 and _kind(dtype) == "f" and dtype.itemsize < real_type().itemsize
 
 
 def _kind(dtype: np.dtype) -> str:
@@ -255,10 +243,10 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
 
 
 def _call(op: str) -> Callable:
-    return lambda graph, params, *args: graph.call(op, *args)
+    return lambda graph, params: getattr(graph, op) if op in ARITHMETIC else partial(graph.call, op)
 
 
-def _select(graph: Graph, params, which, *cases):
+def _select(graph: Graph, which, *cases):
     if graph.is_const(which):
         return cases[int(graph.value[which])]
     if len(cases) == 2:
@@ -278,26 +266,27 @@ def _first_true(graph: Graph, truths: np.ndarray) -> int:
     return found
 
 
-def _power(graph: Graph, params, x: int, y: int) -> int:
+def _power(graph: Graph, x: int, y: int) -> int:
     whole = graph.is_const(y) and graph.value[y].is_integer()
     return graph.power(x, int(graph.value[y])) if whole else graph.call("pow", x, y)
 
 
-def _round(graph: Graph, params, x: int) -> int:
+def _round(graph: Graph, params) -> Callable[[int], int]:
     if params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         raise Unsupported("rounding half away from zero")
-    return graph.call("round", x)
+    return partial(graph.call, "round")
 
 
-_ELEMENTWISE: dict[str, Callable] = {
+# functions of entries of a graph; `params`: of the primitive
+_ELEMENTWISE: dict[str, Callable[[Graph, dict], Callable]] = {
     **{name: _call(name) for name in TABLE},
-    "pow": _power,
+    "pow": lambda graph, params: partial(_power, graph),
     "round": _round,
     "add_any": _call("add"),
-    "square": lambda graph, params, x: graph.mul(x, x),
-    "rsqrt": lambda graph, params, x: graph.div(graph.one, graph.call("sqrt", x)),
-    "integer_pow": lambda graph, params, x: graph.power(x, params["y"]),
-    "select_n": _select,
+    "square": lambda graph, params: lambda x: graph.mul(x, x),
+    "rsqrt": lambda graph, params: lambda x: graph.div(graph.one, graph.call("sqrt", x)),
+    "integer_pow": lambda graph, params: lambda x: graph.power(x, params["y"]),
+    "select_n": lambda graph, params: partial(_select, graph),
     "xor": _call("ne"),
 }
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
@@ -36,7 +35,7 @@ def applied(equation, inputs) -> list[np.ndarray]:
         if result is not None:
             return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
-        result = equation.primitive.bind(*(jnp.asarray(x) for x in inputs), **params)
+        result = equation.primitive.bind(*inputs, **params)
     return [np.asarray(x) for x in (result if equation.primitive.multiple_results else [result])]
 
 
@@ -133,8 +132,6 @@ _CONTROL: dict[str, Callable] = {
     "jourdain_entries": lambda equation, inputs: list(*inputs),
     **{p.name: lambda equation, inputs, f=f: f(np, *inputs, **equation.params) for p, f in MAPS},
 }
-
-# Primitives.
 
 _ENTRYWISE: dict[str, Callable] = {
     **VALUES,
@@ -295,6 +292,14 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
     return reduced
 
 
+def _in_order(x: np.ndarray) -> np.ndarray:
+    """Return integers in the total order of floats: -NaN, -inf, ..., -0, 0, ..., inf, NaN."""
+    if x.dtype.kind != "f":
+        return x
+    bits = x.view(f"i{x.itemsize}")
+    return np.where(bits < 0, bits ^ np.iinfo(bits.dtype).max, bits)
+
+
 def _reshaped(equation, x, *dynamic):
     return x.reshape(equation.outvars[0].aval.shape)
 
@@ -332,6 +337,27 @@ def gathered(params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
     return np.ravel(x)[np.moveaxis(found, range(count, found.ndim), n.offset_dims)]
 
 
+def targets(params, x, indices: np.ndarray, update) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flat places of x that a scatter changes, and the entries that it takes there."""
+    n, count = params["dimension_numbers"], indices.ndim - 1
+    moved = np.moveaxis(update, n.update_window_dims, range(count, update.ndim))
+    window = iter(moved.shape[count:])
+    alone = (*n.inserted_window_dims, *n.operand_batching_dims)
+    sizes = [1 if axis in alone else next(window) for axis in range(x.ndim)]
+    lanes = zip(n.operand_batching_dims, n.scatter_indices_batching_dims, strict=True)
+    found = places(x.shape, indices, sizes, n.scatter_dims_to_operand_dims, lanes, params["mode"]).ravel()
+    return found[found >= 0], moved.ravel()[found >= 0]
+
+
+def scattered(params, x, indices: np.ndarray, update) -> np.ndarray | None:
+    """Return x with the entries of `update` at its places; None if a function changes entries of x there."""
+    if params["update_jaxpr"] is not None:
+        return None
+    flat, (where, entries) = x.flatten(), targets(params, x, indices, update)
+    flat[where] = entries
+    return flat.reshape(x.shape)
+
+
 RULES: dict[str, Callable] = {
     **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
     "dot_general": lambda e, a, b: _reshaped(e, np.matmul(*as_matrices(e, a, b))),
@@ -363,5 +389,11 @@ RULES: dict[str, Callable] = {
     "iota": _iota,
     "pad": _pad,
     "gather": lambda e, x, indices: gathered(e.params, x, indices),
+    "scatter": lambda e, *inputs: scattered(e.params, *inputs),
+    **{
+        f.__name__: lambda e, x, f=f: f(x, *e.params["axes"]).astype(e.params["index_dtype"])
+        for f in (np.argmax, np.argmin)
+    },
+    "lt_to": lambda e, x, y: np.less(*map(_in_order, (x, y))),
     "platform_index": _platform,
 }

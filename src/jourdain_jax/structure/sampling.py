@@ -4,12 +4,13 @@ and right angles), where partitions that are regular at random states may be sin
 
 import itertools
 from collections.abc import Iterator
+from types import ModuleType
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole
+from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole, is_traced
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.assembly import ENOUGH, Assembled, coordinate_bounds, random_states
@@ -88,15 +89,23 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "gue
     """Return configurations from which to search for a start: near q, then the `states` on the constraints
     that are nearest in coordinates that are not `free`, then random ones in the domain.
     """
-    on = array_module(q)
-    q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
     low, high = coordinate_bounds(scene)
-    on_rows = on.asarray(states, q.dtype)
-    apart = on.where(free, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
-    nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
-    near = q + 0.1 * (elsewhere[:GUESSES] - (low + high) / 2)
-    return on.concatenate([near, on_rows[nearest_first], elsewhere[GUESSES:]]).astype(q.dtype)
+    near, width = 0.1 * (elsewhere[:GUESSES] - (low + high) / 2), np.where(high > low, high - low, 1.0)
+    given = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q), states, near, elsewhere[GUESSES:]
+    return (_traced_guesses if is_traced(q) else _guesses)(array_module(q), *given, free, width)
+
+
+def _guesses(
+    on: ModuleType, q, states, near, elsewhere, free, width
+) -> Float[Entries, "guesses coordinates"]:
+    states = on.asarray(states, q.dtype)
+    apart = on.where(free, 0.0, (states - q) / width)
+    nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
+    return on.concatenate([q + near, states[nearest_first], elsewhere]).astype(q.dtype)
+
+
+_traced_guesses = jax.jit(_guesses, static_argnums=0)  # one program instead of one per operation
 
 
 def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Num, PyTree
 
+from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
 from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, of_bodies, velocities_of
@@ -288,7 +289,7 @@ def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
             "tracing (jit, grad, vmap) and that is not a field of the scene; make it one, `name: float = "
             "jj.parameter(unit=...)`, and pass it to the scene"
         )
-    return closed, shape
+    return needed_only(closed), shape
 
 
 def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene:

@@ -269,6 +269,13 @@ def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members
     )
 
 
+def _from_vector(tree) -> Callable:
+    """Return the inverse of `ravel_pytree(tree)[0]`, for which no number is computed."""
+    found: list[Callable] = []
+    jax.eval_shape(lambda tree: found.append(ravel_pytree(tree)[1]), tree)
+    return found[0]
+
+
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
     """Compile [J r], shape (lanes, samples, local + shared + 1), as a function of the shared numbers and one
@@ -281,7 +288,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     zero = lambda x: np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
     zeros = [zero(x) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]
     arrays, rest = eqx.partition(jax.tree.unflatten(treedef, zeros), is_array)
-    (_, of_all), (_, of_run) = map(ravel_pytree, arrays)
+    of_all, of_run = map(_from_vector, arrays)
 
     def lane(common: Float[Array, "shared"], numbers: Float[Array, "own"]) -> Float[Array, "samples width"]:
         row, x = jnp.split(numbers, [len(numbers) - unknowns])
