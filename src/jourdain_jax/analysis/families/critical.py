@@ -14,6 +14,7 @@ consistent rows: G_X has full column rank, and its pseudo-inverse is computed by
 """
 
 from itertools import combinations
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +27,7 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special_program import SpecialProgram, program_of
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import largest, static
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.printing import Printed, complex_numbers
@@ -136,16 +137,27 @@ class Special(eqx.Module):
         L, c = self.linear(near)
         return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
-    def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
-        """Return the Gauss-Newton step, the pseudo-inverse of G_X, and the ratio of its smallest to its
-        largest pivot.
-        """
+    def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
+        """Return (G_X, G)."""
         (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
         G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
         size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])
-        Q, T = jnp.linalg.qr(jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L]))
+        rows = jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w, G])
+        return jnp.concatenate([rows, jnp.column_stack([L, L @ X - c])])
+
+    def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
+        """Return the Gauss-Newton step. In the triangle of (G_X, G) the last column is Q' G."""
+        T = jnp.linalg.qr(self.linearised(scene, X, near), mode="r")
+        return jax.scipy.linalg.solve_triangular(T[:-1, :-1], T[:-1, -1])
+
+    def inverse(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
+        """Return the Gauss-Newton step, the pseudo-inverse of G_X, and the ratio of its smallest to its
+        largest pivot.
+        """
+        rows = self.linearised(scene, X, near)
+        Q, T = jnp.linalg.qr(rows[:, :-1])
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
-        return inverse @ jnp.concatenate([G, L @ X - c]), inverse, jnp.min(pivots) / jnp.max(pivots)
+        return inverse @ rows[:, -1], inverse, jnp.min(pivots) / jnp.max(pivots)
 
     def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
         """Return the point of a scene at X."""
@@ -158,53 +170,83 @@ class Special(eqx.Module):
 @compiled_quickly
 def _solution(special: Special, scene: Scene) -> CriticalPoint:
     """Return the point of a scene, differentiable twice."""
-    # one by one, since each takes a different number of steps
-    lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)
-    X, inverse, condition, code = jax.lax.stop_gradient(
-        lane_by_lane(*jax.lax.stop_gradient((special, scene)))
-    )
+    X, inverse, condition, code = jax.lax.stop_gradient(followed_to(*jax.lax.stop_gradient((special, scene))))
     near = X
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
     return special.point(scene, X, condition, code)
 
 
+class _Followed(NamedTuple):
+    """A point followed to a share `done` of the change of the parameters."""
+
+    X: Unknowns
+    done: Scalar
+    step: Scalar  # the next share
+    tries: Count
+    found: Flag
+
+
 def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
     """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. X is
     NaN unless the code is 0.
 
-    Parameters change linearly from the family's to the given ones. A step whose corrections do not shrink
-    immediately is shortened, so that it cannot lead to another point.
+    Parameters change linearly from the family's to the given ones, first in one step. A step is taken if
+    each of three corrections of Newton's method is at most 0.3 of the one before, which by the theorem of
+    Newton and Kantorovich leaves one solution nearby; otherwise it is shortened. The point is found once the
+    next correction would be below 1e-7.
     """
+    zero, none = jnp.array(0.0), jnp.array(0)
+    start = _Followed(special.normal(special.X), zero, zero + 1, none, jnp.array(False))
+    found = _to_the_end(special, scene, start)
+    X = found.X - special.correction(scene, found.X, found.X)
+    change, inverse, condition = special.inverse(scene, X, found.X)
+    known = found.found & (largest(change) < 1e-8)
+    code = jnp.where(known, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
+    return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
 
-    def once(carried):
-        near, done, step, count, *_ = carried
-        share = jnp.minimum(done + step, 1.0)
-        there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
 
-        def corrected(X, _):
-            change, *beside = special.correction(there, X, near)
-            return X - change, (largest(change), *beside)
+def _once(special: Special, scene: Scene, at: _Followed) -> _Followed:
+    share = jnp.minimum(at.done + at.step, 1.0)
+    there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
 
-        X, ((first, second, third), inverses, conditions) = jax.lax.scan(corrected, near, length=3)
-        good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
-        found = (done == 1) & (third < 1e-8), X, inverses[-1], conditions[-1]
-        return (
-            jnp.where(good, special.normal(X), near),
-            jnp.where(good, share, done),
-            jnp.where(good, 2 * step, step / 4),
-            count + 1,
-            *found,
-        )
+    def corrected(X, _):
+        change = special.correction(there, X, at.X)
+        return X - change, largest(change)
 
-    X, zero = special.normal(special.X), jnp.zeros(())
-    inverse = jnp.zeros((len(X), special.program.rows + len(special.linear(X)[1])))
-    start = X, zero, jnp.ones(()), jnp.zeros((), jnp.int32), jnp.array(False), X, inverse, zero
-    *_, found, X, inverse, condition = jax.lax.while_loop(
-        lambda c: ~c[4] & (c[2] > 1e-3) & (c[3] < 100), once, start
-    )
-    code = jnp.where(found, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
-    return X * jnp.where(code == FOUND, 1.0, jnp.nan), inverse, condition, code
+    X, (first, second, third) = jax.lax.scan(corrected, at.X, length=3)
+    good = (first < 1) & (second <= 0.3 * first + 1e-9) & (third <= 0.3 * second + 1e-9)
+    X, done = jnp.where(good, special.normal(X), at.X), jnp.where(good, share, at.done)
+    step = jnp.where(good, 2 * at.step, at.step / 4)
+    return _Followed(X, done, step, at.tries + 1, good & (share == 1) & (third**2 <= 1e-7 * second))
+
+
+def _goes_on(at: _Followed) -> Flag:
+    return ~at.found & (at.step > 1e-3) & (at.tries < 100)
+
+
+@jax.custom_batching.custom_vmap
+def _to_the_end(special: Special, scene: Scene, at: _Followed) -> _Followed:
+    return jax.lax.while_loop(_goes_on, lambda at: _once(special, scene, at), at)
+
+
+@_to_the_end.def_vmap
+def _of_a_batch(count: int, in_batched, *batch) -> tuple[_Followed, _Followed]:
+    """Follow the samples of a batch together for the first step, then one after the other, since each takes
+    its own number of steps.
+    """
+    own = jax.tree.unflatten(jax.tree.structure(batch), jax.tree.leaves(in_batched))
+    whole = lambda x, own: x if own else jnp.broadcast_to(x, (count, *jnp.shape(x)))
+    special, scene, at = jax.tree.map(whole, batch, own)
+
+    def once(at: _Followed) -> _Followed:
+        k = jnp.argmax(_goes_on(at))
+        new = _once(*jax.tree.map(lambda x: x[k], (special, scene, at)))
+        return jax.tree.map(lambda x, y: x.at[k].set(y), at, new)
+
+    at = jax.vmap(_once)(special, scene, at)
+    at = jax.lax.while_loop(lambda at: jnp.any(_goes_on(at)), once, at)
+    return at, jax.tree.map(lambda x: True, at)
 
 
 @shown_from_users_lines
