@@ -8,11 +8,11 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from unittest import mock
 
 import jax
@@ -79,11 +79,12 @@ _int, _long, _pointer = ctypes.c_uint32, ctypes.c_uint64, ctypes.c_void_p
 
 
 class Driver:
-    """Those functions of `libcuda` that the handler calls, as they are declared in NVIDIA's `cuda.h`;
-    `order`: of threads, `fails`: what a launch returns.
+    """Those functions of `libcuda` that the handler calls, as they are declared in NVIDIA's `cuda.h`, and
+    XLA's memory; `order`: of threads, `fails`: what one of them returns, by its name.
     """
 
-    order, fails = "in order", 0
+    order: str = "in order"
+    fails: Mapping[str, int] = MappingProxyType({})
 
     def __init__(self) -> None:
         self.loaded: list[str] = []
@@ -92,11 +93,43 @@ class Driver:
         memset = _C(ctypes.c_int, _long, _int, ctypes.c_size_t, _pointer)
         launch = _C(ctypes.c_int, _pointer, *[_int] * 7, _pointer, ctypes.POINTER(_pointer), _pointer)
         error = _C(ctypes.c_int, ctypes.c_int, ctypes.POINTER(ctypes.c_char_p))
+        copy = _C(ctypes.c_int, _pointer, _long, ctypes.c_size_t, _pointer)
         self.library = SimpleNamespace(
             cuMemsetD32Async=memset(self._memset),
+            cuMemcpyDtoHAsync_v2=copy(self._copy),
+            cuStreamSynchronize=_C(ctypes.c_int, _pointer)(
+                lambda stream: self.fails.get("cuStreamSynchronize", int(stream != 99))
+            ),
             cuLaunchKernel=launch(self._launch),
             cuGetErrorString=error(self._error),
         )
+        # of XLA's interface: memory, of which it is told the size, and where it is put
+        self.records: dict[int, ctypes.Array] = {}
+        self.largest = 0
+        words = ctypes.POINTER(_long)
+        self.allocate, self.free = (_C(_pointer, words)(f) for f in (self._allocate, self._free))
+        self.interface = (_pointer * 1)()  # XLA's own
+
+    def _allocate(self, asked) -> int | None:
+        size, alignment = asked[3:5]
+        if "DeviceMemory_Allocate" in self.fails:
+            text = ctypes.c_char_p(b"no memory for a record")
+            given = (_long * 4)(28, 0, ctypes.cast(text, _pointer).value, self.fails["DeviceMemory_Allocate"])
+            functions = ctypes.cast(self.interface[0], ctypes.POINTER(_pointer))
+            return _C(_pointer, _pointer)(functions[6])(ctypes.addressof(given))
+        if (asked[0], asked[1], alignment) != (48, 0, 16):
+            return 1
+        record = (ctypes.c_char * size)(*b"\xff" * size)  # what is not written is no number
+        self.records[ctypes.addressof(record)], self.largest = record, max(size, self.largest)
+        asked[5] = ctypes.addressof(record)
+        return None
+
+    def _free(self, asked) -> int | None:
+        return None if len(self.records.pop(asked[4])) == asked[3] and asked[0] == 40 else 1
+
+    def _copy(self, to, place, count, stream) -> int:
+        ctypes.memmove(to, place, count)
+        return self.fails.get("cuMemcpyDtoHAsync_v2", int(stream != 99))
 
     def _memset(self, place, value, count, stream) -> int:
         ctypes.memmove(place, (_int * count)(*[value] * count), 4 * count)
@@ -116,8 +149,8 @@ class Driver:
             None,
         ) or not across:
             return 1  # of a grid without blocks, too
-        if not function or self.fails:
-            return self.fails or 400
+        if not function or "cuLaunchKernel" in self.fails:
+            return self.fails.get("cuLaunchKernel", 400)
         self.launched[self.loaded[function - 1]] += 1
         run, count = _C(None, _pointer, _pointer)(self._twin(function)), across * threads
         each = range(count) if self.order == "in order" else reversed(range(count))
@@ -147,7 +180,7 @@ class Driver:
 
 DRIVER = Driver()
 
-# `handler`, which gives the stream 99 where XLA, on a CPU, has none
+# `handler`, which gives the stream 99 and memory where XLA, on a CPU, has none
 _STREAM = """
 define ptr @stream(ptr %asked) {
   %at = getelementptr i64, ptr %asked, i64 3
@@ -156,7 +189,7 @@ define ptr @stream(ptr %asked) {
 }
 define ptr @handler(ptr %frame) {
   %words = alloca i64, i64 21
-  %api = alloca i64, i64 11
+  %api = alloca i64, i64 17
   call void @llvm.memcpy.p0.p0.i64(ptr %words, ptr %frame, i64 168, i1 0)
   %extension_at = getelementptr ptr, ptr %frame, i64 1
   %extension = load ptr, ptr %extension_at
@@ -165,9 +198,14 @@ define ptr @handler(ptr %frame) {
 with:
   %api_at = getelementptr ptr, ptr %frame, i64 2
   %own = load ptr, ptr %api_at
-  call void @llvm.memcpy.p0.p0.i64(ptr %api, ptr %own, i64 88, i1 0)
+  store ptr %own, ptr inttoptr (i64 INTERFACE to ptr)
+  call void @llvm.memcpy.p0.p0.i64(ptr %api, ptr %own, i64 136, i1 0)
   %stream_at = getelementptr ptr, ptr %api, i64 10
   store ptr @stream, ptr %stream_at
+  %allocate_at = getelementptr ptr, ptr %api, i64 15
+  store i64 ALLOCATE, ptr %allocate_at
+  %free_at = getelementptr ptr, ptr %api, i64 16
+  store i64 FREE, ptr %free_at
   %place = getelementptr ptr, ptr %words, i64 2
   store ptr %api, ptr %place
   br label %on
@@ -180,14 +218,21 @@ declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 
 
 @contextmanager
-def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int = 0) -> Iterator[Counter[str]]:
+def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, **fails: int) -> Iterator[Counter[str]]:
     """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts
     of all kernels, each with how often it ran.
     """
+    stream = _STREAM
+    for name, there in (
+        ("ALLOCATE", DRIVER.allocate),
+        ("FREE", DRIVER.free),
+        ("INTERFACE", DRIVER.interface),
+    ):
+        stream = stream.replace(name, str(ctypes.cast(there, _pointer).value))
     register, launched, text = (
         ffi.register,
         Counter[str](),
-        gpu.handler_text().replace("@handler(", "@served(") + _STREAM,
+        gpu.handler_text().replace("@handler(", "@served(") + stream,
     )
     jax.clear_caches()
     with (
@@ -204,7 +249,7 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int =
             memory=lambda: memory,
             _of_device={82: 65536, 81: 65536, 16: 1}.__getitem__,  # registers, cache, multiprocessors
         ),
-        mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched),
+        mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched, largest=0),
     ):
         mlir.register_lowering(value_kernels._call_p, value_kernels._on_nvidia, platform="cpu")
         try:
@@ -212,6 +257,7 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int =
         finally:
             mlir.register_lowering(value_kernels._call_p, value_kernels.on_cpu, platform="cpu")
             jax.clear_caches()
+            assert not DRIVER.records, "memory of XLA's that was not given back"
 
 
 def driver_of_devices(

@@ -106,7 +106,10 @@ def test_events_after_which_a_motion_goes_on(kind):
 # What happens where the driver refuses.
 
 
-def _end(speed, model=jj.models.ChaplyginSleigh()):  # noqa: B008
+SLEIGH = jj.models.ChaplyginSleigh()
+
+
+def _end(speed, model=SLEIGH):
     return jj.simulate(model, {"x_rate": speed, "heading_rate": 0.3}, ts=[0.1]).q_end
 
 
@@ -118,15 +121,17 @@ def test_lanes_come_last_and_what_they_share_is_given_once():
             .as_text()
         )
     calls = [*re.findall(r"operand_layouts = (.*), result_layouts = (.*)} : \((.*)\) -> \((.*)\)\n", text)]
-    forth, back = (next(call for call in calls if call[2].count(",") == count) for count in (2, 4))
+    forth, back = (next(call for call in calls if call[2].count(",") == count) for count in (2, 5))
     # starts of 7 lanes, what they share, times; states of 2 times and ends
     assert re.fullmatch(r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<2xf64>", forth[2])
     assert forth[:2] == (
         "[dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>, dense<0> : tensor<1xindex>]",
         "[dense<[0, 2, 1]> : tensor<3xindex>, dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>]",
     )
+    # the same, cotangents of states and ends, times, and the largest number of trial steps
     assert re.fullmatch(
-        r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<7x2x\d+xf64>, tensor<7x\d+xf64>, tensor<2xf64>",
+        r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<7x2x\d+xf64>, tensor<7x\d+xf64>, tensor<2xf64>,"
+        r" tensor<f64>",
         back[2],
     )
 
@@ -136,12 +141,24 @@ def test_no_lanes_are_no_call_that_fails():
         assert jax.jit(jax.vmap(_end))(np.zeros(0)).shape[0] == 0
 
 
-def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
-    run = lambda: jax.jit(jax.vmap(_end))(np.linspace(0.4, 0.6, 3))
+@pytest.mark.parametrize(
+    ("function", "code", "said"),
+    [
+        ("cuLaunchKernel", 2, "RESOURCE_EXHAUSTED: out of memory"),
+        ("cuLaunchKernel", 1, "INTERNAL: invalid argument"),
+        ("cuMemcpyDtoHAsync_v2", 1, "INTERNAL: invalid argument"),
+        ("cuStreamSynchronize", 400, "INTERNAL: invalid resource handle"),
+        ("DeviceMemory_Allocate", 8, "RESOURCE_EXHAUSTED: no memory for a record"),
+    ],
+)
+def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text(function, code, said):
+    of = jax.vmap(jax.grad(lambda speed: _end(speed)[0]))
+    run = lambda: np.asarray(jax.jit(of)(np.linspace(0.4, 0.6, 3)))
     expected = run()
-    for code, said in ((2, "RESOURCE_EXHAUSTED: out of memory"), (1, "INTERNAL: invalid argument")):
-        with gpu_twin.in_place_of_a_gpu(fails=code), pytest.raises(jax.errors.JaxRuntimeError, match=said):
+    with gpu_twin.in_place_of_a_gpu(**{function: code}) as launched:
+        with pytest.raises(jax.errors.JaxRuntimeError, match=said):
             run()
+        assert not any("@step_back(" in text for text in launched)
     with gpu_twin.in_place_of_a_gpu():  # all goes on
         np.testing.assert_array_equal(run(), expected)
 
@@ -155,15 +172,25 @@ def test_a_kernel_that_this_process_has_not_loaded_is_an_error():
         jax.jit(_end)(0.4)
 
 
-def test_the_record_of_steps_keeps_to_the_memory_of_the_model():
-    memory = 10**6
-    model = jj.build(jj.models.ChaplyginSleigh(), memory=memory)
-    run = jax.jit(jax.vmap(jax.grad(lambda speed: _end(speed, model)[0])))
-    with gpu_twin.in_place_of_a_gpu():
-        largest = 8 * max(
-            map(int, re.findall(r"tensor<(\d+)xf64>", run.lower(np.linspace(0.4, 0.6, 100)).as_text()))
-        )
-    assert 0.9 * memory < largest <= memory + 8 * ffi.FIRST_OF_SCRATCH
+def test_the_record_has_a_slot_for_each_step_and_keeps_to_the_memory_of_the_model():
+    speeds = np.geomspace(0.4, 4_000.0, 100)
+    found = jax.vmap(lambda speed: jj.simulate(SLEIGH, {"x_rate": speed, "heading_rate": 0.3}, ts=[0.1]))(
+        speeds
+    )
+    tries = int(np.max(found.accepted + found.rejected))
+    assert tries > int(np.min(found.accepted + found.rejected))
+    for memory, all_fit in ((10**9, True), (10**6, False)):
+        model = jj.build(SLEIGH, memory=memory)
+        run = jax.jit(jax.vmap(jax.grad(lambda speed, model=model: _end(speed, model)[0])))
+        with gpu_twin.in_place_of_a_gpu():
+            said = [
+                *re.findall(r"most_slots = (\d+) : i64, slot = ([1-9]\d*) : i64", run.lower(speeds).as_text())
+            ]
+            ((most, slot),) = {(int(most), int(slot)) for most, slot in said}
+            jax.block_until_ready(run(speeds))
+            assert gpu_twin.DRIVER.largest == slot * min(tries, most)
+        assert (tries <= most) == all_fit
+        assert 0.9 * memory < slot * most <= memory
 
 
 def _reason(monkeypatch, **library) -> str:

@@ -156,6 +156,7 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
         ("void** args;", "void** args; int more;"),
         ("int64_t* dims;", "int64_t* sizes;"),
         ("(XLA_FFI_Stream_Get)", "(XLA_FFI_Lost)"),
+        ("(XLA_FFI_DeviceMemory_Free)", "(XLA_FFI_Lost)"),
     ],
 )
 def test_an_interface_with_another_layout_is_not_known(old, new, tmp_path, monkeypatch):

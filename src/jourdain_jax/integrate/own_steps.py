@@ -138,7 +138,7 @@ class OwnSteps(Integrator):
         assert isinstance(self.solver, Method)
         start = native_motion.start_of(setup, begun)
         by_start, by_known = native_motion.cotangents(
-            self._form(setup), self.solver, start, asked, self.memory, g
+            self._form(setup), self.solver, start, asked, self.memory, found, g
         )
 
         def args(by_args: tuple) -> tuple:

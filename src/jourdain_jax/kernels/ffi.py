@@ -28,7 +28,6 @@ from jourdain_jax.kernels.ir_value import Value
 
 HANDLER, KERNEL = "handler", "kernel"
 WORDS, MOST_BUFFERS = 4, 16  # words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays
-FIRST_OF_SCRATCH = 8  # index of the first double of a kernel's scratch memory after the lane counter
 _LAYOUTS = {
     "CallFrame": "api ctx stage args rets attrs future",
     "Buffer": "dtype data rank dims",
@@ -37,8 +36,11 @@ _LAYOUTS = {
     "Attrs": "size types names attrs",
     "Error_Create_Args": "message errc",
     "Stream_Get_Args": "ctx stream",
+    "DeviceMemory_Allocate_Args": "ctx size alignment data",
+    "DeviceMemory_Free_Args": "ctx size data",
 }
-_FUNCTIONS = ["Error_Create", "Stream_Get"]  # functions called here: the first one and the fifth
+# functions called here, by their place in the interface
+FUNCTIONS = {0: "Error_Create", 4: "Stream_Get", 9: "DeviceMemory_Allocate", 10: "DeviceMemory_Free"}
 # word indices of 8 bytes
 ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
 
@@ -84,8 +86,8 @@ def _stated_version() -> tuple[int, int] | None:
     same = all(
         _members(header, struct) == f"struct_size extension_start {rest}" for struct, rest in _LAYOUTS.items()
     )
-    functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[:5:4]
-    if not same or functions != _FUNCTIONS or None in numbers:
+    functions = dict(enumerate(re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)))
+    if not (same and functions.items() >= FUNCTIONS.items()) or None in numbers:
         return None
     major, minor = (int(number[1]) for number in numbers if number)
     return (major, minor) if major == 0 else None
@@ -157,17 +159,20 @@ def answer_metadata(w: Writer, frame: Value) -> None:
 def _write_kernel(
     w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Given]], None]
 ) -> None:
-    """Write `kernel(words)`, which every thread of a GPU runs. Its last result is scratch memory."""
+    """Write `kernel(words)`, which every thread of a GPU runs. Its last result is the lane
+    counter; the words after it describe the record of steps.
+    """
     with w.function(
         KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"
     ):
         words = Value(w, "ptr", "%words")
         each = [
             Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words)
-            for k in range(arguments + results + 1)
+            for k in range(arguments + results + 2)
         ]
-        w.own = each[-1].data, last_size(w, each[-1])
-        body(each[:arguments], each[arguments:-1])
+        counter, record = each[-2:]
+        w.own = counter.data, record.data, last_size(w, record)
+        body(each[:arguments], each[arguments:-2])
         w.give()
 
 

@@ -21,17 +21,17 @@ class Writer:
     """Builder of a module of functions on vectors of `lanes` doubles.
 
     `fused`: whether `fma` rounds once; `threads`: number of threads that share the lanes on a CPU; `device`:
-    whether the module is for a GPU. `scratch`: for a GPU, the doubles of external memory per slot (0: none)
-    and the bytes for all threads.
+    whether the module is for a GPU. `record`: for a GPU, the doubles of a slot of the record of steps (0: no
+    record) and the most bytes of all slots.
     """
 
     eps = 2.0**-52
 
     def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
         self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device
-        self.scratch = (0, 1 << 62)  # none needed, no limit
-        # a kernel's scratch memory, with the lane counter first, and its size in doubles
-        self.own: tuple[Value, Value]
+        self.record = (0, 1 << 62)  # none, no limit
+        # of a kernel: pointers to the lane counter and to the record, and the record's slots of each thread
+        self.own: tuple[Value, Value, Value]
         self.real, self.truth, self.whole = f"<{lanes} x double>", f"<{lanes} x i1>", f"<{lanes} x i64>"
         self._lines: list[str] = []
         self._declared: dict[str, str] = {}

@@ -14,19 +14,25 @@ from jourdain_jax.kernels import host
 
 TRIPLE = "nvptx64-nvidia-cuda"
 WARP = 32
+CALLED_BY_HANDLER = (
+    "cuGetErrorString",
+    "cuLaunchKernel",
+    "cuMemcpyDtoHAsync_v2",
+    "cuMemsetD32Async",
+    "cuStreamSynchronize",
+)
 _CALLED = (
+    *CALLED_BY_HANDLER,
     "cuCtxPopCurrent_v2",
     "cuCtxPushCurrent_v2",
     "cuDeviceGetAttribute",
-    "cuDeviceGetName",
+    "cuDeviceGetCount",
     "cuDevicePrimaryCtxRetain",
     "cuDeviceTotalMem_v2",
-    "cuGetErrorString",
+    "cuInit",
     "cuKernelGetAttribute",
-    "cuLaunchKernel",
     "cuLibraryGetKernel",
     "cuLibraryLoadData",
-    "cuMemsetD32Async",
 )
 
 

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import filled
-from jourdain_jax.calculus.reals import Indices
+from jourdain_jax.calculus.reals import Indices, Scalar
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
@@ -79,9 +79,9 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
         w.give(w.null)
     write_handler(
         w,
-        4 + arguments_of_samples(form) + w.device,
+        4 + arguments_of_samples(form) + 2 * w.device,
         1,
-        lambda arguments, results: write_job(w, form, arguments, results),
+        lambda arguments, results: write_job(w, form, arguments[: len(arguments) - w.device], results),
     )
 
 
@@ -262,7 +262,7 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable:
     """Return reverse mode as a function of samples, of the rows of a start, of cotangents of the states at
-    the goals and of the end, with its time last, and of the goals.
+    the goals and of the end, with its time last, of the goals, and of the number of trial steps.
 
     It returns cotangents of the initial state, and of the requested numbers among the known ones (`asked`). A
     state is followed by its tangent.
@@ -273,6 +273,7 @@ def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Call
         lambda *_: ((count,),),
         arguments_of_samples(form),
         constant=constant_rows(form),
+        counted=True,
     )
     return lambda *arguments: run_rows(*arguments)[0]
 
@@ -281,18 +282,18 @@ def flow_back(
     form: Form, method: Method, asked: Indices, memory: int
 ) -> Callable[..., Float[Array, "found"]]:
     """Return a function that returns cotangents of the start's state and of the requested known numbers
-    (`asked`). Its arguments are the start, and cotangents of the states at the goals, of the end and of the
-    end's time.
+    (`asked`). Its arguments are the start, cotangents of the states at the goals, of the end and of the end's
+    time, and the number of trial steps.
     """
     n = form.y
 
     @jax.custom_jvp
-    def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):
-        return _pulled(kernel_back(form, method, asked, memory), start, g, ends)
+    def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"], tries: Scalar):
+        return _pulled(kernel_back(form, method, asked, memory), start, g, ends, tries)
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):
-        (start, g, ends), (along, dg, dends) = primals, tangents
+        (start, g, ends, tries), (along, dg, dends, _) = primals, tangents
         dg, dends = filled(dg), filled(dends)
         raised, more = with_tangents(form, start, along)
         # of the state and its tangent, at the goals, at the end, and of its time
@@ -300,11 +301,11 @@ def flow_back(
         both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
         # events need the slopes of samples
         raised = replace(raised, time_moves=form.has_events and bool(form.sampled))
-        d = _pulled(kernel_back(raised, method, asked, memory), more, *both)
+        d = _pulled(kernel_back(raised, method, asked, memory), more, *both, tries)
         return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
 
     return own
 
 
-def _pulled(kernel: Callable, start: Start, g, ends) -> Float[Array, "found"]:
-    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals)
+def _pulled(kernel: Callable, start: Start, g, ends, tries) -> Float[Array, "found"]:
+    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals, tries)

@@ -46,10 +46,10 @@ from jourdain_jax.kernels.ffi import (
 )
 from jourdain_jax.kernels.ir_value import Value
 
-# Words of a job, shared by all threads: number of samples, number of times, index of the next sample, size of
-# a kernel's scratch memory in doubles (`ffi.py`), on a GPU a pointer to the shared rows and the number of
-# rows of times (one, or one per sample), words of samples, then pointers to the arrays
-COUNT, TIMES, NEXT, OWN, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(7)
+# Words of a job, shared by all threads: number of samples, number of times, index of the next sample; on a
+# GPU the pointer to the record of steps, its slots of each thread, the pointer to the shared rows, and the
+# number of rows of times (one, or one per sample); words of samples, then pointers to the arrays
+COUNT, TIMES, NEXT, RECORD, SLOTS, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(8)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
@@ -101,7 +101,8 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
     w.store(last_size(w, times), job, TIMES)
     start_counting(w, job, NEXT)
     if common:
-        for word, value in ((OWN, w.own[1]), (COMMON, common.data), (ROWS_OF_TIMES, product(w, times, 1))):
+        own = *w.own[1:], common.data, product(w, times, 1)
+        for word, value in zip((RECORD, SLOTS, COMMON, ROWS_OF_TIMES), own, strict=True):
             w.store(value, job, word)
     if form.sampled:
         store_samples(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)

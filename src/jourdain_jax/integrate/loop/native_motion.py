@@ -149,19 +149,24 @@ def modes_among(inputs: Inputs) -> Indices:
 
 
 def cotangents(
-    form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved
+    form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, found: Solved, g: Solved
 ) -> tuple[Integrated, list]:
     """Return cotangents of the start, and of each requested known number (`asked`), from
-    the cotangents of the results.
+    the results and their cotangents.
 
     `memory`: limit in bytes for records of steps.
     """
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
     ends = jnp.concatenate([g.y_end.rows, g.t_end[None], g.passed.ts[: form.transitions]])
-    found = flow_back(form, method, which, memory)(start, cotangents_of_states(g), ends)
-    known = dict(zip(which, entries_of(found[form.y :]), strict=True))
-    return Integrated.of(found[: form.y], form), [known.get(i) for i in range(len(asked))]
+    tries = found.accepted + found.rejected
+    if form.has_events:  # counts omit the trial steps that locate an event, of which few events need eight
+        tries += 8 * (1 + found.crossings + jnp.isfinite(found.passed.ts).sum())
+    back = flow_back(form, method, which, memory)(
+        start, cotangents_of_states(g), ends, jnp.asarray(tries, real_type())
+    )
+    known = dict(zip(which, entries_of(back[form.y :]), strict=True))
+    return Integrated.of(back[: form.y], form), [known.get(i) for i in range(len(asked))]
 
 
 def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:

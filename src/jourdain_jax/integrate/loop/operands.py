@@ -22,6 +22,7 @@ class Operands(NamedTuple):
     samples: int  # number of leading operands that are samples
     others: int  # number of trailing operands that are separate arrays; those in between are rows of a start
     constant: tuple[tuple[int, float], ...]  # rows of a start that are not operands
+    counted: bool  # whether the last operand is the number of trial steps, which a CPU does not take
 
     def _laned(self, x: Array, rank: int) -> Array:
         """Return the operand with all batch axes."""
@@ -67,21 +68,23 @@ class Operands(NamedTuple):
 
     def side_by_side(self, *values: Array) -> list[Array]:
         """Return the arrays for a CPU: the batch axis is first, except in samples that lanes share."""
-        rows, last = self._rows(values), len(values) - self.others
+        rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
         starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
-        return [*values[: self.samples], *starts, *map(self._laned, values[last:], self.ranks[last:])]
+        return [*values[: self.samples], *starts, *map(self._laned, values[last:end], self.ranks[last:end])]
 
     def given_once(self, *values: Array) -> list[Array]:
         """Return the arrays for a GPU: the shared rows of a start follow the others, without batch axis. If
-        all lanes share the times (the last operand), the times have no batch axis either.
+        all lanes share the times, the times have no batch axis either. Of numbers of trial steps the largest
+        is taken.
         """
-        rows, last = self._rows(values), len(values) - self.others
+        rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
         starts = [
             self._joined([x for x in rows if x[2] is shared], values[-1].dtype, not shared)
             for shared in (False, True)
             if rows
         ]
-        others = [*map(self._laned, values[last:], self.ranks[last:])]
-        if rows and values[-1].ndim == self.ranks[-1]:
-            others[-1] = values[-1]
-        return [*values[: self.samples], *starts, *others]
+        others = [*map(self._laned, values[last:end], self.ranks[last:end])]
+        if rows and values[end - 1].ndim == self.ranks[end - 1]:
+            others[-1] = values[end - 1]
+        tries = [lax.reduce_max(x, range(x.ndim)) for x in values[end:]]
+        return [*values[: self.samples], *starts, *others, *tries]

@@ -15,8 +15,8 @@ from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, copied, each_row, room_of_lanes
-from jourdain_jax.integrate.loop.loop import COUNT, NEXT, OWN, STARTS, TIMES
-from jourdain_jax.kernels.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, of_lane, taken_in
+from jourdain_jax.integrate.loop.loop import COUNT, NEXT, RECORD, SLOTS, STARTS, TIMES
+from jourdain_jax.kernels.ffi import handed_out, lanes_taken, next_lane, of_lane, taken_in
 from jourdain_jax.kernels.ir_value import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
@@ -108,7 +108,7 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
 def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
     """Write the parts of the module that a record of this size in bytes needs."""
     if w.device:
-        w.scratch = Slot.of(form, method).all, memory
+        w.record = Slot.of(form, method).all, memory
     else:
         _write_more_room(w)
 
@@ -160,10 +160,9 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
-    """Return slots that fit into a thread's memory. The numbers of neighbouring threads are interleaved."""
+    """Return the slots of a thread. The numbers of neighbouring threads are interleaved."""
     here, (thread, threads) = w.room(slot.all), w.thread()
-    record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
-    slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
+    record, slots = w.at(w.load(job, RECORD, "ptr"), thread), w.load(job, SLOTS, "i64")
 
     def place(number: Value, row: int | Value) -> Value:
         return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads)

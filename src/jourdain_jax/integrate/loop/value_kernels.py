@@ -49,12 +49,14 @@ def called(
     of_samples: int = 0,
     effort: int = 2,
     constant: Mapping[int, float] | None = None,
+    counted: bool = False,
 ) -> Callable:
     """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: function from
     arguments to the shapes of results.
 
     The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. If some rows
     of a start are `constant`, one more argument holds the other rows: vectors of the state, then numbers.
+    `counted`: whether the last argument is the number of trial steps, by which a GPU sizes the record.
     """
 
     @cache
@@ -68,11 +70,11 @@ def called(
         w = MachineWriter(1, True, device=True)
         w.common = shared
         write(w)
-        return gpu.registered(w.text, w.scratch)
+        return gpu.registered(w.text, w.record)
 
     def call(lanes: int, threads: int, batch: tuple[int, ...], ranks: tuple[int, ...], arguments: tuple):
         others = len(arguments) - of_samples - (constant is not None)
-        operands = Operands(batch, ranks, of_samples, others, tuple((constant or {}).items()))
+        operands = Operands(batch, ranks, of_samples, others, tuple((constant or {}).items()), counted)
         how = {
             "handler": handler,
             "kernel": kernel,
