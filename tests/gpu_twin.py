@@ -247,7 +247,8 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, **fails: int
             text_for=lambda text, architecture: text,
             loaded=DRIVER.load,
             memory=lambda: memory,
-            _of_device={82: 65536, 81: 65536, 16: 1}.__getitem__,  # registers, cache, multiprocessors
+            # registers, cache, multiprocessors, blocks
+            _of_device={82: 65536, 81: 65536, 16: 1, 106: 32}.__getitem__,
         ),
         mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched, largest=0),
     ):
@@ -274,7 +275,6 @@ def driver_of_devices(
 
     own = {
         "cuInit": lambda _: fails,
-        "cuDeviceGetCount": says(lambda _: len(capabilities)),
         "cuDeviceGetAttribute": says(lambda _, which, device: capabilities[device][which - 75]),
         "cuGetErrorString": says(lambda *_: b"no CUDA-capable device is detected"),
     }

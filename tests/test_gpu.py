@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import gpu_twin
@@ -193,20 +194,37 @@ def test_the_record_has_a_slot_for_each_step_and_keeps_to_the_memory_of_the_mode
         assert 0.9 * memory < slot * most <= memory
 
 
-def _reason(monkeypatch, **library) -> str:
+def _reason(monkeypatch, uses=(0,), **library) -> str:
+    devices = [SimpleNamespace(local_hardware_id=number) for number in uses]
+    monkeypatch.setattr(jax, "local_devices", lambda backend: devices)
     monkeypatch.setattr(nvidia, "driver", lambda: gpu_twin.driver_of_devices(**library))
     return nvidia.reason_against.__wrapped__()
 
 
 def test_without_a_gpu_that_serves_it_is_said_why(monkeypatch):
-    assert not _reason(monkeypatch, capabilities=[(9, 0), (7, 5)])
+    assert not _reason(monkeypatch, (0, 1), capabilities=[(9, 0), (7, 5)])
     assert nvidia.architecture() == "sm_75"
-    assert "no GPU" in _reason(monkeypatch, capabilities=[])
-    assert "compute capability 7.5" in _reason(monkeypatch, capabilities=[(9, 0), (7, 0)])
+    assert "compute capability 7.5" in _reason(monkeypatch, (0, 1), capabilities=[(9, 0), (7, 0)])
     assert "no CUDA-capable device" in _reason(monkeypatch, capabilities=[], fails=100)
     assert "older than CUDA 12" in _reason(monkeypatch, capabilities=[], missing="cuLibraryLoadData")
     monkeypatch.setattr(nvidia, "driver", mock.Mock(side_effect=OSError("libcuda.so.1: no such file")))
     assert "libcuda.so.1" in nvidia.reason_against.__wrapped__()
+
+
+def test_gpus_that_jax_does_not_use_are_left_alone(monkeypatch):
+    """Nothing follows from them, and the driver sets nothing up there."""
+    assert not _reason(monkeypatch, (1,), capabilities=[(7, 0), (9, 0)])
+    assert nvidia.architecture() == "sm_90"
+    asked = []
+
+    def says(name):
+        return lambda *given: asked.append((name, given)) or 0
+
+    names = [name for name in nvidia._CALLED if name not in nvidia.CALLED_BY_HANDLER]
+    monkeypatch.setattr(nvidia, "driver", lambda: SimpleNamespace(**{name: says(name) for name in names}))
+    nvidia.loaded(b"", "kernel")
+    devices = {name: given[-1] for name, given in asked if "Retain" in name or "Attribute" in name}
+    assert devices == {"cuDevicePrimaryCtxRetain": 1, "cuKernelGetAttribute": 1}
 
 
 def test_a_model_says_on_which_devices_it_is_integrated():

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
+import jax
+
 from jourdain_jax.kernels import host
 
 TRIPLE = "nvptx64-nvidia-cuda"
@@ -26,7 +28,6 @@ _CALLED = (
     "cuCtxPopCurrent_v2",
     "cuCtxPushCurrent_v2",
     "cuDeviceGetAttribute",
-    "cuDeviceGetCount",
     "cuDevicePrimaryCtxRetain",
     "cuDeviceTotalMem_v2",
     "cuInit",
@@ -62,11 +63,9 @@ def reason_against() -> str:
         return f"NVIDIA's driver is older than CUDA 12 (it lacks {missing[0]})"
     try:
         _checked(library.cuInit(0))
-        if not _devices():
-            return "NVIDIA's driver finds no GPU"
+        return "" if _capabilities() else "it requires an NVIDIA GPU of compute capability 7.5 or newer"
     except RuntimeError as error:
         return str(error)
-    return "" if _capabilities() else "it requires an NVIDIA GPU of compute capability 7.5 or newer"
 
 
 def reason_against_text() -> str:
@@ -95,12 +94,13 @@ def _said(function: str, *what, found=ctypes.c_int) -> int:
     return number.value
 
 
-def _devices() -> range:
-    return range(_said("cuDeviceGetCount"))  # handles equal indices
+def _devices() -> list[int]:
+    """Return the driver's numbers of the GPUs that JAX uses in this process."""
+    return [device.local_hardware_id for device in jax.local_devices(backend="cuda")]
 
 
 def _of_device(attribute: int) -> int:
-    """Return the smallest value of an attribute over all devices."""
+    """Return the smallest value of an attribute over all devices of JAX."""
     return min(_said("cuDeviceGetAttribute", attribute, device) for device in _devices())
 
 
@@ -140,9 +140,9 @@ def text_for(module: str, architecture: str) -> str:
 
 @contextmanager
 def _in_context() -> Iterator[None]:
-    """Run the enclosed code in this process's context of the first device, which JAX shares."""
+    """Run the enclosed code in JAX's context of its first device."""
     context = ctypes.c_void_p()
-    _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
+    _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), _devices()[0]))
     _checked(driver().cuCtxPushCurrent_v2(context))
     try:
         yield
@@ -161,17 +161,18 @@ def loaded(text: bytes, name: str) -> Loaded:
         )
         _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
         # attributes of a kernel: 3 bytes of local memory, 4 registers
-        return Loaded(
-            kernel.value or 0, *(_said("cuKernelGetAttribute", attribute, kernel, 0) for attribute in (3, 4))
-        )
+        device = _devices()[0]
+        sizes = [_said("cuKernelGetAttribute", attribute, kernel, device) for attribute in (3, 4)]
+        return Loaded(kernel.value or 0, *sizes)
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
     """Return the number of warps for these `lanes`: at most as many as registers allow and as local memory
     fits the first-level cache, but at least four per multiprocessor.
     """
-    # attributes of a device: 82 its registers, 81 cache usable as shared memory, 16 its multiprocessors
+    # attributes of a device: 16 its multiprocessors; of each of them 82 the registers, 81 the cache usable as
+    # shared memory, 106 the maximum number of blocks
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(81) // max(1, WARP * kernel.local)
     # one for each of the four parts of a multiprocessor
-    return min(-(lanes // -WARP), _of_device(16) * min(by_registers, WARP, max(by_cache, 4)))
+    return min(-(lanes // -WARP), _of_device(16) * min(by_registers, _of_device(106), max(by_cache, 4)))
