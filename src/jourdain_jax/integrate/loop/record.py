@@ -1,9 +1,10 @@
 """Record of the steps of a motion for reverse mode (`adjoint.py`): one slot per trial
 step, for all lanes of a block.
 
-The memory of the model, shared by all threads, limits the number of slots; on a CPU the record
-grows up to this limit. If a motion takes more steps, its lanes run forward again for each window of
-slots, the last window first.
+The memory of the model, shared by all threads, limits the number of slots. On a CPU the record
+grows up to this limit; on a GPU it has a slot for each trial step that the forward call has
+counted, up to this limit. If a motion takes more steps, its lanes run forward again for each
+window of slots, the last window first.
 """
 
 import math
