@@ -28,7 +28,7 @@ import sys
 import threading
 import tokenize
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from figures import Figures, figure, fresh, main
@@ -101,22 +101,30 @@ def packages() -> set[str]:
     return {path.parent.name for path in SOURCE.glob("*/__init__.py")}
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a node and all statements in it, without their expressions."""
+    yield node
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, block, ()):
+            yield from statements(inner)
+
+
 def code_tokens(text: str) -> int:
     """Return the number of code tokens of a file."""
     documented = {
         node.body[0].lineno
-        for node in ast.walk(ast.parse(text))
+        for node in statements(ast.parse(text))
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         and ast.get_docstring(node) is not None
     }
     lines, total, opened = text.splitlines(keepends=True), 0, []
-    starts = [sum(map(len, lines[:k])) for k in range(len(lines) + 1)]
+    place = lambda line, column: sum(map(len, lines[: line - 1])) + column
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == OPENS:
-            opened.append(starts[token.start[0] - 1] + token.start[1])
+            opened.append(place(*token.start))
         elif token.type == CLOSES:
             begin = opened.pop()
-            total += 0 if opened else 1 + (starts[token.end[0] - 1] + token.end[1] - begin - 1) // 40
+            total += 0 if opened else 1 + (place(*token.end) - begin - 1) // 40
         elif not opened and token.type == tokenize.STRING:
             total += 0 if token.start[0] in documented else 1 + (len(token.string) - 1) // 40
         elif not opened:

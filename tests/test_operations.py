@@ -148,6 +148,7 @@ def test_entries_at_places_are_those_of_jax(f):
 
 SQUARED = lambda x: x.at[1].apply(jnp.square)
 OF_NUMBERS = [SQUARED, lambda x: jnp.argmax(x, axis=1), lambda x: jnp.argmin(-x), lambda x: x.at[7].set(5.0)]
+OF_NUMBERS += [lambda x: jnp.argsort(-x, axis=1), lambda x: jnp.abs(jnp.linalg.qr(x[2])[1])]
 
 
 @pytest.mark.parametrize("f", [*ENTRIES, *OF_NUMBERS])

@@ -69,7 +69,7 @@ class Turning(jj.Scene):
 class TurningBody(Turning):
     """Its motion, with moments that a body can have."""
 
-    moments: float = jj.parameter(log_cholesky([0.5, 0.7, 0.4])[:3])
+    moments: float = jj.parameter(0.5 * np.log([0.3, 0.1, 0.4]))  # of 0.5, 0.7, 0.4 kg m^2
 
     def inertia(self):
         return inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))

@@ -27,12 +27,12 @@ def evaluated(
         zip(jaxpr.invars, arguments, strict=True)
     )
 
-    def read(atom):
-        return number(atom.val, atom.aval) if isinstance(atom, Literal) else values[atom]
+    def read(atoms) -> list:
+        return [number(x.val, x.aval) if isinstance(x, Literal) else values[x] for x in atoms]
 
     for equation in jaxpr.eqns:
-        values |= zip(equation.outvars, results(equation, [read(x) for x in equation.invars]), strict=True)
-    return [read(x) for x in jaxpr.outvars]
+        values |= zip(equation.outvars, results(equation, read(equation.invars)), strict=True)
+    return read(jaxpr.outvars)
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:

@@ -9,7 +9,6 @@ from inspect import signature
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.jaxprs import evaluated, needed_only
@@ -66,7 +65,7 @@ def eager_if_concrete(f: Callable) -> Callable:
         bound = parameters.bind(*given, **named)
         bound.apply_defaults()
         arguments = bound.args
-        return f(*arguments) if is_traced(arguments) else jax.tree.map(jnp.asarray, known(*arguments))
+        return f(*arguments) if is_traced(arguments) else jax.device_put(known(*arguments))
 
     vars(run)["cache_clear"] = vars(known)["cache_clear"]
     return run

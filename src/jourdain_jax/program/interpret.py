@@ -20,8 +20,9 @@ from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
+from jourdain_jax.program.entry_places import gathered, scattered, targets
 from jourdain_jax.program.graph import ARITHMETIC, Graph, Unsupported
-from jourdain_jax.program.numpy_backend import applied, gathered, scattered, targets
+from jourdain_jax.program.numpy_backend import applied
 
 _LINEAR = re.compile(r"relu6? at .*[/\\]jax[/\\]")  # piecewise linear, with the derivative of each piece
 _HOME = f"{Path(__file__).parent.parent}{os.sep}"  # folder of this package

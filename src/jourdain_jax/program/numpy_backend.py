@@ -3,9 +3,8 @@
 Primitives without a rule here run one by one in JAX, which takes tens of milliseconds each to compile.
 """
 
-import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -14,6 +13,7 @@ import numpy as np
 from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
 from jourdain_jax.calculus.markers import MAPS
 from jourdain_jax.calculus.scalar_operations import VALUES
+from jourdain_jax.program.entry_places import gathered, scattered
 
 MOST_TURNS = 5000  # iteration limit of a `while_loop`, beyond which it counts as endless
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
@@ -225,6 +225,18 @@ def _svd(equation, A):
     return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
 
 
+def _qr(equation, A):
+    if equation.params["pivoting"]:
+        return None  # left to JAX
+    return list(np.linalg.qr(A, "complete" if equation.params["full_matrices"] else "reduced"))
+
+
+def _sort(equation, *arrays):
+    keys, axis = arrays[: equation.params["num_keys"]], equation.params["dimension"]
+    order = np.lexsort(keys[::-1], axis=axis)
+    return [np.take_along_axis(x, order, axis) for x in arrays]
+
+
 def _cholesky(equation, A):
     try:
         return np.linalg.cholesky(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
@@ -304,60 +316,6 @@ def _reshaped(equation, x, *dynamic):
     return x.reshape(equation.outvars[0].aval.shape)
 
 
-def places(shape: Sequence[int], indices: np.ndarray, sizes: Sequence[int], axes, lanes, mode) -> np.ndarray:
-    """Return the flat places of windows in an array of this shape; their axes follow the axes of the indices.
-
-    The windows have the given sizes and begin at `indices` along `axes`. A window beyond the array has places
-    -1, unless the mode moves it inside. `lanes`: pairs of a batch axis of the array and of the indices.
-    """
-    begin = np.zeros((*indices.shape[:-1], len(shape)), int)
-    begin[..., list(axes)] = indices
-    for axis, along in lanes:
-        begin[..., axis] = np.indices(indices.shape[:-1], sparse=True)[along]
-    inside = np.clip(begin, 0, np.subtract(shape, sizes))
-    strides = np.cumprod([1, *shape[:0:-1]])[::-1][: len(shape)]
-    first = (inside @ strides)[(..., *[None] * len(shape))]
-    found = first + np.arange(math.prod(shape)).reshape(shape)[tuple(map(slice, sizes))]
-    if mode != jax.lax.GatherScatterMode.FILL_OR_DROP:
-        return found
-    beyond = np.any(begin != inside, axis=-1)
-    return np.where(beyond.reshape(first.shape), -1, found)
-
-
-def gathered(params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
-    """Return the windows of x that begin at the indices; None if one lies beyond x."""
-    n, count = params["dimension_numbers"], indices.ndim - 1
-    lanes = zip(n.operand_batching_dims, n.start_indices_batching_dims, strict=True)
-    found = places(x.shape, indices, params["slice_sizes"], n.start_index_map, lanes, params["mode"])
-    if np.any(found < 0):
-        return None
-    found = np.squeeze(
-        found, tuple(count + axis for axis in (*n.collapsed_slice_dims, *n.operand_batching_dims))
-    )
-    return np.ravel(x)[np.moveaxis(found, range(count, found.ndim), n.offset_dims)]
-
-
-def targets(params, x, indices: np.ndarray, update) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat places of x that a scatter changes, and the entries that it takes there."""
-    n, count = params["dimension_numbers"], indices.ndim - 1
-    moved = np.moveaxis(update, n.update_window_dims, range(count, update.ndim))
-    window = iter(moved.shape[count:])
-    alone = (*n.inserted_window_dims, *n.operand_batching_dims)
-    sizes = [1 if axis in alone else next(window) for axis in range(x.ndim)]
-    lanes = zip(n.operand_batching_dims, n.scatter_indices_batching_dims, strict=True)
-    found = places(x.shape, indices, sizes, n.scatter_dims_to_operand_dims, lanes, params["mode"]).ravel()
-    return found[found >= 0], moved.ravel()[found >= 0]
-
-
-def scattered(params, x, indices: np.ndarray, update) -> np.ndarray | None:
-    """Return x with the entries of `update` at its places; None if a function changes entries of x there."""
-    if params["update_jaxpr"] is not None:
-        return None
-    flat, (where, entries) = x.flatten(), targets(params, x, indices, update)
-    flat[where] = entries
-    return flat.reshape(x.shape)
-
-
 RULES: dict[str, Callable] = {
     **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
     "dot_general": lambda e, a, b: _reshaped(e, np.matmul(*as_matrices(e, a, b))),
@@ -375,6 +333,8 @@ RULES: dict[str, Callable] = {
         x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]
     ),
     "svd": _svd,
+    "qr": _qr,
+    "sort": _sort,
     "lu": _lu,
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,

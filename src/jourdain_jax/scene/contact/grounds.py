@@ -29,6 +29,7 @@ from jourdain_jax.calculus.reals import (
     checked_real,
     described,
     known_numbers,
+    real_type,
     static,
 )
 from jourdain_jax.calculus.rotations import rot_y
@@ -111,9 +112,11 @@ class Plane(_Ground):
         """
         if tilt is not None and normal is not None:
             raise ValueError("a plane has both a `tilt` and a `normal`, expected one of them; omit one")
-        if normal is None:
-            axes = _turned(0.0 if tilt is None else tilt)
+        if tilt is not None:
+            axes = _turned(tilt)
             self.normal, tangents = axes[:, 2], axes[:, :2].T
+        elif normal is None:
+            self.normal, tangents = (jnp.asarray(x, real_type()) for x in (np.eye(3)[2], np.eye(3)[:2]))
         else:
             self.normal = checked_real(normal, "normal of a plane", (3,), advice="give a unit vector")
             tangents = tangents_of(self.normal)
