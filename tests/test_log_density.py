@@ -27,7 +27,7 @@ def runs(sigma=0.02, starts=(0.3, -0.2)):
     return [
         jj.Experiment(
             TS,
-            {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))},
+            {"x": np.asarray(jax.jit(closed)(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))},
             sigma,
             start={"x": x + 0.01},
             unknown_start=("x",),
@@ -147,7 +147,7 @@ def test_unknowns_lead_back_and_stay_finite_far_away():
     x = jnp.array([[-2.0, 0.3, 1.5], [3.0, 800.0, -20.0]])
     for point in x:
         assert_allclose(density.unconstrain(density.named(point)), point, rtol=1e-7)
-    assert np.isfinite(jax.jacrev(density.constrain)(x[1])).all()
+    assert np.isfinite(jax.jit(jax.jacrev(density.constrain))(x[1])).all()
 
 
 def test_failing_motion_has_no_density():
