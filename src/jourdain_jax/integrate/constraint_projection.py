@@ -138,8 +138,8 @@ def _kernel(rows: Rows, given_in: np.dtype):
 
 def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
     """Return the projected quantities and the residual, by machine code."""
-    real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
-    found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
+    real, given = real_type(), (*entries(scene, rows.program.parameters), t, *vectors)
+    found = _kernel(rows, real)(tuple(jnp.asarray(x, real) for x in given))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
 
 
@@ -156,8 +156,7 @@ def row_functions(program: RowProgram) -> RowFunctions:
         return BY_AUTODIFF
     rows, speeds = len(program.phi), len(program.u)
     closures, coordinates = len(program.g), len(program.q)
-    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
-    at = [*parameters, program.t, *program.q]
+    at = [*program.entries, program.t, *program.q]
 
     def matrix(entries: dict[tuple[int, int], int], rows: int, columns: int) -> list[int]:
         return [entries.get((i, k), program.graph.zero) for i in range(rows) for k in range(columns)]
@@ -173,20 +172,19 @@ def row_functions(program: RowProgram) -> RowFunctions:
         found = entries(scene, program.parameters)
         return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
 
-    def in_a_row(given, t, *vectors):
-        first = parameters_of(given) if isinstance(given, Scene) else given
-        return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
+    def numbers_of(given):
+        return parameters_of(given) if isinstance(given, Scene) else given
 
     def closures_at(given, t, q):
-        found = of_closures(in_a_row(given, t, q))
+        found = of_closures(numbers_of(given), t, q)
         return found[:closures], found[closures:].reshape(closures, coordinates)
 
     def rows_at(given, t, q, u, inputs):
-        found = of_rows(in_a_row(given, t, q, u, inputs))
+        found = of_rows(numbers_of(given), t, q, u, inputs)
         return found[:rows], found[rows:].reshape(rows, speeds)
 
     def masses_at(given, t, q):
-        return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
+        return of_masses(numbers_of(given), t, q).reshape(speeds, speeds)
 
     return RowFunctions(
         closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of

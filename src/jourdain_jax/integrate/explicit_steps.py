@@ -207,6 +207,11 @@ def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
     return jnp.where(shrank, result_codes.SHRANK, jnp.where(code == RUNNING, result_codes.SUCCESS, code))
 
 
+def off(where: Callable, magnitude: Callable, x, rtol, atol):
+    """Return a number of a state that is larger by the error which a step may have."""
+    return x + where(x < 0.0, -1.0, 1.0) * (atol + rtol * magnitude(x))
+
+
 LEAST_ORDER, MOST_ORDER = 4, 30
 
 

@@ -200,6 +200,10 @@ class Writer:
         """Call a function that returns nothing."""
         self._lines.append(f"  call void @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
+    def barrier(self) -> None:
+        """Let LLVM assume that any memory may change here."""
+        self._lines.append('  call void asm sideeffect "", "~{memory}"()')
+
     def external(self, function: str, result: str, *arguments: Value) -> Value:
         """Call a function from outside the module and return its result."""
         self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"

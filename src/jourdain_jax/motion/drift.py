@@ -21,9 +21,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar, eps_of
 from jourdain_jax.equations.projection import linearised_rows
+from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod
 from jourdain_jax.integrate.setup import Setup
-from jourdain_jax.integrate.vector_fields.field import Instant, Integrated
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant, Integrated
 from jourdain_jax.motion.trajectories import diagnostics
 
 
@@ -56,14 +57,20 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
     """Return T and V (J) at states, and again with each coordinate and speed increased by
     the possible error of a step.
     """
-    field, scene, inputs, fixed, _ = args
-    rtol, atol = setup.tolerances
-    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
-    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
-    at = lambda state: field.energies(Instant(scene, fixed, state[0], state[1], inputs(state[0])))
+    field, (*_, inputs, fixed, _) = setup.field, args
+
+    def at(state):
+        t, y = state
+        here = Instant(setup.scene, fixed, t, y, inputs(t))
+        if isinstance(field, ByProgram) and field.native:
+            return field.native.energies(*here.of_program, *setup.tolerances).reshape(2, 2)
+        both = jax.tree.map(lambda x: jnp.stack([x, off(jnp.where, jnp.abs, x, *setup.tolerances)]), y)
+        return jax.lax.map(lambda y: field.energies(here._replace(y=y)), both)
+
     # loads of dense matrices may be callbacks without batching
-    found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
-    return found.reshape(2, -1, 2)
+    states = jax.lax.stop_gradient((t, y))
+    found = jax.lax.map(at, states) if field.lowered is None else jax.vmap(at)(states)
+    return jnp.moveaxis(found, 1, 0)
 
 
 def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:

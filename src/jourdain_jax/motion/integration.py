@@ -104,10 +104,11 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     (`calculus/markers.py`). Derivatives of the setup are zero if its motion is not
     used, and NaN after a failure.
     """
-    numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
+    place = lambda s: (s.scene, s.start.q, s.start.u, s.inputs, s.t0, s.t1, s.ts)
+    numbers, rest = eqx.partition(place(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
     each, asked = entered(*lanes_first(leaves))  # also numbers that all motions share
-    return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
+    return eqx.tree_at(place, setup, eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
 def _plain(setup: Setup, timely: Flag) -> Plain:
@@ -156,7 +157,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     args = field, scene, inputs, fixed, origin
     puts_back = field.projects and not integrator.own
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
-    valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
+    sound = begun.timely & begun.right
+    valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & sound
 
     def saved_state(tau, y, valid):
         # unreached times may hold any value: compute at the end state, then mark as NaN
@@ -174,24 +176,21 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         )
 
     # append start and end to the saved states, so that this is compiled once
-    start_and_end = (
-        (jnp.zeros_like(solved.t_end), begun.y0, begun.timely),
-        (solved.t_end, solved.y_end, begun.timely),
-    )
+    start_and_end = ((jnp.zeros_like(solved.t_end), begun.y0, sound), (solved.t_end, solved.y_end, sound))
     all_states = jax.tree.map(
         lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]),
         (solved.ts, solved.ys, valid),
         *start_and_end,
     )
     found, pivots, states, moved_by = jax.vmap(saved_state)(*all_states)
-    found = jax.tree.map(lambda x: jnp.where(begun.right, x, jnp.nan), found)
     # Negative if A_z was singular along the motion; fmin ignores NaN, which marks a lost end. The
     # barrier hides from XLA that all pivots are one without constraints, which it would otherwise
     # evaluate for seconds while compiling.
     pivots = jax.lax.optimization_barrier(pivots)
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
-    lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
+    plain = begun.plain.args if begun.plain else args
+    lost = energy_lost(energies_near(setup, plain, *states), solved.accepted) if conserves(setup) else False
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
     drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
     code = solved.code

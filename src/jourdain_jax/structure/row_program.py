@@ -56,6 +56,11 @@ class RowProgram:
         Indices  # coordinates of other states, on the geometric constraints, on which `right` also depends
     )
 
+    @property
+    def entries(self) -> list[int]:
+        """Return the nodes of the entries of parameters that are used."""
+        return [n for leaf in self.parameters for n in leaf if n >= 0]
+
 
 @once_per_class
 def row_program(scene: Scene) -> RowProgram | None:

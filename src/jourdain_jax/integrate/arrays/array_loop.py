@@ -50,7 +50,7 @@ class Loop(NamedTuple):
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
         """Return the start, and the rows that steps do not change."""
         t, form = start.goals[0], self.form
-        given = constant_rows(form)
+        given = {first + i: x for first, run in constant_rows(form).items() for i, x in enumerate(run)}
         later = [row for row in range(form.integrated, form.rows["mode"].stop) if row not in given]
         given |= dict(zip(later, start._replace(known=((),)).numbers(), strict=True))
         given = {row: jnp.broadcast_to(jnp.asarray(x, t.dtype), t.shape) for row, x in given.items()}

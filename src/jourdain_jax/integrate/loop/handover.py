@@ -14,14 +14,13 @@ from jourdain_jax.integrate.loop.form import PROGRESS, Form
 Numbers = tuple[PerLane, ...]  # one number per row
 
 
-def constant_rows(form: Form) -> dict[int, float]:
-    """Return the rows that are equal at the start of every motion: index -> value."""
-    rows = form.rows
-    said = {"code": float(RUNNING), "event": -1.0, "pivot": math.inf}
-    begun = dict.fromkeys(range(form.integrated, form.returned), 0.0) | {
-        rows[name].start: x for name, x in said.items()
-    }
-    return {row: x for row, x in begun.items() if row not in rows["h"]}
+def constant_rows(form: Form) -> dict[int, tuple[float, ...]]:
+    """Return the rows that are equal at the start of every motion: index of the first -> values."""
+    rows, begun = form.rows, [0.0] * form.returned
+    for name, x in (("code", float(RUNNING)), ("event", -1.0), ("pivot", math.inf)):
+        begun[rows[name].start] = x
+    h = rows["h"].start
+    return {form.integrated: tuple(begun[form.integrated : h]), h + 1: tuple(begun[h + 1 :])}
 
 
 class Start(NamedTuple):

@@ -21,7 +21,8 @@ class Operands(NamedTuple):
     ranks: tuple[int, ...]  # ranks of the operands without batch axes
     samples: int  # number of leading operands that are samples
     others: int  # number of trailing operands that are separate arrays; those in between are rows of a start
-    constant: tuple[tuple[int, float], ...]  # rows of a start that are not operands
+    # rows of a start that are not operands: index of the first, and values
+    constant: tuple[tuple[int, tuple[float, ...]], ...]
     counted: bool  # whether the last operand is the number of trial steps, which a CPU does not take
 
     def _laned(self, x: Array, rank: int) -> Array:
@@ -35,8 +36,8 @@ class Operands(NamedTuple):
         operands = [*range(self.samples, len(values) - self.others)]
         while operands or row in constant:
             if row in constant:
-                found.append((constant[row], 0, True))
-                row += 1
+                found.append((np.array(constant[row]), 1, True))
+                row += len(constant[row])
             else:
                 x, rank = values[k := operands.pop(0)], self.ranks[k]
                 found.append((x, rank, x.ndim == rank == 0))
@@ -69,22 +70,23 @@ class Operands(NamedTuple):
     def side_by_side(self, *values: Array) -> list[Array]:
         """Return the arrays for a CPU: the batch axis is first, except in samples that lanes share."""
         rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
-        starts = [self._joined(rows, values[-1].dtype, True)] if rows else []
-        return [*values[: self.samples], *starts, *map(self._laned, values[last:end], self.ranks[last:end])]
+        start = self._joined(rows, values[-1].dtype, True)
+        return [*values[: self.samples], start, *map(self._laned, values[last:end], self.ranks[last:end])]
 
     def given_once(self, *values: Array) -> list[Array]:
         """Return the arrays for a GPU: the shared rows of a start follow the others, without batch axis. If
         all lanes share the times, the times have no batch axis either. Of numbers of trial steps the largest
         is taken.
         """
+        if not self.others:
+            return self.side_by_side(*values)
         rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
         starts = [
             self._joined([x for x in rows if x[2] is shared], values[-1].dtype, not shared)
             for shared in (False, True)
-            if rows
         ]
         others = [*map(self._laned, values[last:end], self.ranks[last:end])]
-        if rows and values[end - 1].ndim == self.ranks[end - 1]:
+        if values[end - 1].ndim == self.ranks[end - 1]:
             others[-1] = values[end - 1]
         tries = [lax.reduce_max(x, range(x.ndim)) for x in values[end:]]
         return [*values[: self.samples], *starts, *others, *tries]

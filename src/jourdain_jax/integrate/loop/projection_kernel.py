@@ -190,9 +190,8 @@ class Rows:
         the constraints follow them.
         """
         program = self.program
-        parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [
-            *parameters,
+            *program.entries,
             program.t,
             *program.q,
             *(() if self.kind == "positions" else (*program.u, *program.inputs)),

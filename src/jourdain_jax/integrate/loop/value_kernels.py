@@ -15,9 +15,10 @@ at saved states. XLA computes speeds of few operations (`lowering/lowered_equati
 XLA's tracing and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from jourdain_jax.calculus.derivative_errors import OtherDeviceError
 from jourdain_jax.calculus.derivatives import Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, lanes_of
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
+from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.loop.lanes import MachineWriter
 from jourdain_jax.integrate.loop.operands import Operands
 from jourdain_jax.kernels import ffi, gpu, host, nvidia
@@ -48,15 +50,15 @@ def called(
     shapes: Callable,
     of_samples: int = 0,
     effort: int = 2,
-    constant: Mapping[int, float] | None = None,
+    constant: Mapping[int, tuple[float, ...]] = MappingProxyType({}),
     counted: bool = False,
 ) -> Callable:
     """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: function from
     arguments to the shapes of results.
 
-    The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. If some rows
-    of a start are `constant`, one more argument holds the other rows: vectors of the state, then numbers.
-    `counted`: whether the last argument is the number of trial steps, by which a GPU sizes the record.
+    The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. The next one
+    holds vectors and numbers, which are rows of a start; `constant`: its other rows. `counted`: whether the
+    last argument is the number of trial steps, by which a GPU sizes the record.
     """
 
     @cache
@@ -73,8 +75,8 @@ def called(
         return gpu.registered(w.text, w.record)
 
     def call(lanes: int, threads: int, batch: tuple[int, ...], ranks: tuple[int, ...], arguments: tuple):
-        others = len(arguments) - of_samples - (constant is not None)
-        operands = Operands(batch, ranks, of_samples, others, tuple((constant or {}).items()), counted)
+        others = len(arguments) - of_samples - 1
+        operands = Operands(batch, ranks, of_samples, others, tuple(constant.items()), counted)
         how = {
             "handler": handler,
             "kernel": kernel,
@@ -182,23 +184,31 @@ batching.primitive_batchers[_call_p] = _more_lanes
 
 
 def nodes_called(
-    graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1
-) -> Callable[[Array], Array]:
-    """Return values of nodes of a graph as a function of the values of the variables."""
+    graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1, moved: Collection[int] = ()
+) -> Callable[..., Array]:
+    """Return values of nodes of a graph as a function of the values of the variables, in one or more vectors
+    and numbers. If variables are `moved`, two more are rtol and atol, and values at the state `off` follow.
+    """
+    states = 2 if moved else 1
 
     def write(w: MachineWriter) -> None:
         with w.procedure("row", "state found") as (state, found):
             known = {n: w.load(state, k) for k, n in enumerate(variables)}
-            for k, value in written_in_turn(w, graph, nodes, known):
-                w.store(as_real(w, value), found, k)
-        write_rows(w, len(variables), len(nodes))
+            for i in range(states):
+                for k, value in written_in_turn(w, graph, nodes, known):
+                    w.store(as_real(w, value), found, k + i * len(nodes))
+                errors = [w.load(state, len(variables) + k) for k in range(2)] if moved else ()
+                known |= {n: off(w.where, w.magnitude, known[n], *errors) for n in moved}
+        write_rows(w, len(variables) + 2 * (states - 1), states * len(nodes))
 
-    kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
-    return lambda x: kernel(x)[0]
+    kernel = called(write, lambda *_: ((states * len(nodes),),), effort=effort)
+    return lambda *parts: kernel([jnp.asarray(x, real_type()) for x in parts])[0]
 
 
-def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Return values of nodes as a function of the values of the variables. Structural zeros cost nothing."""
+def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
+    """Return values of nodes as a function of the values of the variables, like `nodes_called`. Structural
+    zeros cost nothing.
+    """
     graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
@@ -263,7 +273,7 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
         return (back(*arguments, g),)
 
     values = with_rules(by_machine_code, Rules(push, pull))
-    return values
+    return lambda *parts: values(jnp.hstack(parts).astype(real_type()))
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
@@ -299,7 +309,8 @@ class Beside:
     needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
     fixed: Callable[[Array], Array]  # function of those entries
     speeds: Callable[..., Array] | None  # all speeds; None if XLA is faster
-    numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
+    pivots: Callable[..., Array]  # like the energies, without derivatives
+    energies: Callable[..., Array]  # at a state, then at the state `off` it
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
     def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
@@ -307,16 +318,12 @@ class Beside:
         parameters = entries(scene, self.needed)
         if not self.program.fixed or not parameters:  # nothing to pass, or nothing requested
             return self.program.fixed_values(scene)
-        return entries_of(self.fixed(jnp.concatenate(parameters)))
+        return entries_of(self.fixed(*parameters))
 
     def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Speeds, Scalar]:
         """Return the values of `Lowered.speeds_and_pivot`."""
         of = self.speeds or self.program.all_speeds
-        return of(fixed, t, q, y, inputs), smallest_pivot(self.numbers(fixed, t, q, y, inputs)[:-2])
-
-    def energies_at(self, *state) -> Float[Array, "2"]:
-        """Return the values of `Lowered.energies_at`."""
-        return self.numbers(*state)[-2:]
+        return of(fixed, t, q, y, inputs), smallest_pivot(self.pivots(fixed, t, q, y, inputs))
 
 
 @lru_cache(maxsize=64)
@@ -331,7 +338,9 @@ def beside(program: Lowered) -> Beside | None:
         tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters
     )
     given = [n for leaf in needed for n in leaf if n >= 0]
-    numbers, speeds = _at_state(program, [*program.pivots, *program.energies], nodes_called), None
+    pivots, speeds = _at_state(program, program.pivots, nodes_called), None
+    state = {*program.traced.q.tolist(), *(int(program.traced.u[k]) for k in program.independent)}
+    energies = _at_state(program, program.energies, partial(nodes_called, moved=state))
     # Operations from which speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers
     # (228 operations) 0.69 and 0.54, of 16 (436) 2.6 and 1.8, whose derivatives compile in 13 and 6 s; 256
     # bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of 4 trailers (124) 44 and 39, their
@@ -348,7 +357,8 @@ def beside(program: Lowered) -> Beside | None:
         needed,
         values_of_nodes(graph, program.fixed, given),
         speeds,
-        lambda *state: numbers(*jax.lax.stop_gradient(state)),
+        (lambda *state: pivots(*jax.lax.stop_gradient(state))) if program.pivots else lambda *_: jnp.zeros(0),
+        lambda *state: energies(*jax.lax.stop_gradient(state)),
         _at_state(program, program.at_start, values_of_nodes),
     )
 
@@ -361,9 +371,8 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
         program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]]
     )
 
-    def values(fixed, t, q, y, inputs) -> Float[Array, "nodes"]:
-        known = jnp.stack([*(fixed[k] for k in which), t])
-        return run(jnp.concatenate([jnp.asarray(x, real_type()) for x in (known, q, y, inputs)]))
+    def values(fixed, *others) -> Float[Array, "nodes"]:
+        return run(*(fixed[k] for k in which), *others)
 
     return values
 
@@ -385,8 +394,7 @@ def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag
     """Return whether parameters, and the bodies and contacts that depend on them, are valid as defined by
     `parameter_faults` and `faults_at`.
     """
-    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs, others]
-    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
-    given = [*parameters, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    parts = [*entries(scene, program.parameters), t, q, u, inputs, others]
+    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
     run = nodes_called(program.graph, [program.right], given)
-    return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
+    return run(*jax.lax.stop_gradient(parts))[0] > 0

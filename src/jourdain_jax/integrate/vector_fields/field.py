@@ -354,7 +354,7 @@ class ByProgram(VectorField):
         return self.program.values(self.program.at_start, *state)
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
-        return (self.native or self.program).energies_at(*at.of_program)
+        return self.program.energies_at(*at.of_program)
 
     def events(self, at: Instant) -> Float[Array, "events *lanes"]:
         if self.program.events:
