@@ -100,6 +100,13 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
     return _with_rates(run, rates)
 
 
+def with_derivatives_of(function: Callable, value, *arguments):
+    """Return `value`, which equals `function(value, *arguments)`, with the derivatives of this function. It
+    must have a batch axis if an argument has one.
+    """
+    return differentiated_as(function, lambda value, *_: value)(value, *arguments)
+
+
 def pushed_by_jax(run: Callable) -> Callable:
     """Return the `push` rule of a function that JAX differentiates forward."""
 

@@ -21,6 +21,7 @@ point.
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,6 +60,15 @@ def lanes_first(tree):
     return jax.tree.unflatten(treedef, leaves)
 
 
+def stopped(tree):
+    """Return the tree without derivatives: `jax.lax.stop_gradient` as one operation."""
+    leaves, treedef = jax.tree.flatten(tree)
+    real = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
+    for i, x in zip(real, _stopped_p.bind(*(leaves[i] for i in real)), strict=True):
+        leaves[i] = x
+    return jax.tree.unflatten(treedef, leaves)
+
+
 def lanes_of(values, axes) -> int:
     """Return the batch size from the axes that JAX passes to a batching rule (None for an array without a
     batch axis).
@@ -79,6 +89,11 @@ def _with_lanes_first(values, axes):
     return lanes_first_p.bind(*with_lanes_first(values, axes)), [0] * len(values)
 
 
+_stopped_p = identity("jourdain_stopped")
+ad.primitive_jvps[_stopped_p] = lambda primals, tangents: (
+    _stopped_p.bind(*primals),
+    [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in primals],
+)
 lanes_first_p = identity("jourdain_lanes_first")
 ad.primitive_jvps[lanes_first_p] = lambda primals, tangents: (lanes_first_p.bind(*primals), list(tangents))
 ad.primitive_transposes[lanes_first_p] = lambda cotangents, *values: list(cotangents)

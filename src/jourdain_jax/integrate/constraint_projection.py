@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import differentiated_as
+from jourdain_jax.calculus.derivatives import differentiated_as, with_derivatives_of
 from jourdain_jax.calculus.reals import Entries, Speeds, rank_cutoff, real_type, static
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
@@ -94,10 +94,7 @@ def put_positions(
     if known is None:
         return _by_either(usual, "positions", False, by_xla)(*given)
 
-    def of_known(_, *given):
-        return by_xla(functions_of_rows(usual), *given)
-
-    return differentiated_as(of_known, lambda known, *_: known)(known, *given)
+    return with_derivatives_of(lambda _, *given: by_xla(functions_of_rows(usual), *given), known, *given)
 
 
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.jumps import jumps
+from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import (
     as_real,
     checked_unless_traced,
@@ -73,7 +74,8 @@ class Mode(eqx.Module):
         """Return the number at time t; at a transition, the one after it."""
         if self.ts is None or self.values is None:
             return self.value
-        passed = jnp.searchsorted(*jax.lax.stop_gradient((self.ts, t * self.direction)), side="right")
+        known = stopped((self.ts, t * self.direction))
+        passed = jnp.searchsorted(*known, side="right", method="compare_all")
         return jnp.concatenate([jnp.asarray(self.value)[None], self.values])[passed]
 
 
@@ -82,11 +84,11 @@ class Inputs(eqx.Module):
 
     channels: tuple[Callable, ...]
 
-    def __call__(self, t) -> Float[Array, "inputs"]:
+    def __call__(self, t) -> Float[Array | np.ndarray, "inputs"]:
         """Return the vector of inputs at time t."""
         if self.channels:
             return jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels])
-        return jnp.zeros(0)
+        return np.zeros(0, real_type())
 
     @property
     def constant(self) -> bool:

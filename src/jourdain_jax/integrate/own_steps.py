@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE, DifferentiationModeError
-from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_rules
+from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_derivatives_of, with_rules
 from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays
@@ -29,7 +29,7 @@ from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, flow
 from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import driven, may_jump
-from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved
+from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved, Times
 from jourdain_jax.integrate.time_programs import FunctionOfTime
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
@@ -186,16 +186,25 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
     A reached time equals its goal; the loop itself gives the time of a stop event. A time that was not
     reached keeps its distance from the start.
     """
-    numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
-    goals, later = setup.goals(setup.ts), start - numbers(start)
-    y0 = mover(begun.args)(begun.y0, start, -later)
-    times = begun.plain.times if begun.plain else {name: getattr(setup, name) for name in ("ts", "t0", "t1")}
-    setup = setup._replace(**jax.tree.map(numbers, times))
-    found = run(
-        setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, setup.t0)))
-    )
+    numbers = jax.lax.stop_gradient
+    alone = setup.at(begun.plain.times if begun.plain else numbers(setup.times))
+
+    def moved_start(y0, args) -> Integrated:
+        return mover(args)(y0, args[-1], numbers(args[-1]) - args[-1])
+
+    y0, args = with_derivatives_of(moved_start, begun.y0, begun.args), (*begun.args[:-1], alone.t0)
+    found = run(alone, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, args)))
+    return with_derivatives_of(partial(_moved, mover), found, begun.args, setup.times, alone.ts)
+
+
+def _moved(mover: Callable, found: Solved, args: tuple, times: Times, ts) -> Solved:
+    """Return a motion with derivatives with respect to its times; `ts`: the saved times without
+    derivatives.
+    """
+    numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, args
+    goals, later = times.goals, start - numbers(start)
     passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
-    transitions = passed.times(numbers(start), setup.ts, number[:-1], direction)
+    transitions = passed.times(numbers(start), ts, number[:-1], direction)
     moved = mover((field, scene, in_phases(inputs, transitions, passed.modes, direction), fixed, start))
     event = (found.code == result_codes.EVENT) & (found.accepted > 0)
     t_end = numbers(found.t_end)

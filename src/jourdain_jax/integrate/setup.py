@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, array_module, eps_of
+from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, eps_of
 from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
@@ -111,6 +111,34 @@ class Integrator(abc.ABC):
         return eqx.filter_vmap(self.solved)(timed, begun)
 
 
+class Times(NamedTuple):
+    """Saved times, start and end of a motion, its first and its longest step."""
+
+    ts: Float[Entries, "*lanes times"]
+    t0: Float[Entries, "*lanes"]
+    t1: Float[Entries, "*lanes"]
+    dt0: Float[Entries, "*lanes"] | float
+    longest: Float[Entries, "*lanes"] | float
+
+    def fitting(self, timely: "Flag | np.bool_") -> "Times":
+        """Return times that any loop accepts: round-off puts none beyond the end, and a short span replaces
+        inconsistent times.
+        """
+        ts, t0, t1 = self[:3]
+        if timely is np.True_:
+            return self._replace(ts=jax.lax.clamp(jnp.minimum(t0, t1), ts, jnp.maximum(t0, t1)))
+        direction = jnp.sign(t1 - t0)
+        inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+        # 1e-9 s, for motions that are not requested
+        short = Times(np.linspace(0.0, 1e-9, len(ts)), 0.0, 1e-9, 1e-10, 1e-9)
+        return Times(*(jnp.where(timely, x, y) for x, y in zip(self._replace(ts=inside), short, strict=True)))
+
+    @property
+    def goals(self) -> Float[Array, "times *lanes"]:
+        """Return the times since the start at which steps must end: the saved times and the end."""
+        return jnp.concatenate([self.ts, self.t1[None]]) - self.t0
+
+
 class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes 50 us
     """Motion to be integrated; in a batch all arrays have a leading batch axis."""
 
@@ -127,26 +155,27 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     integrator: Integrator
     usual: Usual | None  # typical sizes for projecting the start; None if it is on its constraints
     judged: bool  # whether probing has already checked these parameters, at many states
+    fits: bool = False  # whether concrete times are known to be consistent
     reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
 
     @property
     def timely(self) -> "Flag | np.bool_":
         """Return whether the times are consistent."""
+        if self.fits:
+            return np.True_
+        (ts, t0, t1), eps = self.times[:3], float(eps_of(self.ts))
+        in_order = jnp.all((ts[1:] - ts[:-1]) * jnp.sign(t1 - t0) > 0)
         # slip, impact and rest cannot be reversed in time
-        forwards = (self.t1 > self.t0) | (not self.scene.switching.contacts)
-        return times_fit(self.ts, self.t0, self.t1) & forwards
+        forwards = (t1 > t0) | (not self.scene.switching.contacts)
+        return ends_fit(ts[0], ts[-1], t0, t1, eps) & in_order & forwards
 
     def fitting(self, timely: "Flag | np.bool_") -> "Setup":
-        """Return the setup with times that any loop accepts: round-off puts none beyond the end, and a short
-        span replaces inconsistent times.
-        """
-        ts, t0, t1 = self.ts, self.t0, self.t1
-        direction = jnp.sign(t1 - t0)
-        inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        # 1e-9 s, for motions that are not requested
-        short = {"ts": np.linspace(0.0, 1e-9, len(ts)), "t0": 0.0, "t1": 1e-9, "dt0": 1e-10, "longest": 1e-9}
-        own = self._replace(ts=inside)
-        return self._replace(**{name: jnp.where(timely, getattr(own, name), x) for name, x in short.items()})
+        """Return the setup with times that any loop accepts."""
+        return self.at(self.times.fitting(timely))
+
+    def at(self, times: Times) -> "Setup":
+        """Return the setup with other times."""
+        return self._replace(**times._asdict())
 
     @property
     def reason_against_machine_code(self) -> str:
@@ -157,9 +186,10 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
         """Return the maximum number of steps, including those forced by sample times of inputs."""
         return self.integrator.max_steps + (0 if knots is None else len(knots))
 
-    def goals(self, ts) -> Float[Array, "times *lanes"]:
-        """Return the times since the start at which steps must end: the saved times and the end."""
-        return jnp.concatenate([ts, self.t1[None]]) - self.t0
+    @property
+    def times(self) -> Times:
+        """Return the times of the motion."""
+        return Times(self.ts, self.t0, self.t1, self.dt0, self.longest)
 
     @property
     def shortest(self) -> PerLane:
@@ -175,7 +205,7 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
 class Plain(NamedTuple):
     """Numbers of a motion as given: without derivatives, without batch axis if all samples share them."""
 
-    times: dict  # as in a `Setup`
+    times: Times
     args: tuple  # as in `Begun`, without the vector field and the scene
 
 
@@ -190,19 +220,13 @@ class Begun(eqx.Module):
     plain: Plain | None = None  # for machine code, which receives shared numbers once
 
 
-def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
-    """Return whether the span is finite and not empty, and the saved times lie in it in
-    order; also for traced times.
+def ends_fit(first, last, t0, t1, eps: float) -> "Flag | bool":
+    """Return whether the span is finite and not empty, and encloses the first and the last saved time in its
+    direction; for floats and for traced times.
     """
-    xp = array_module((ts, t0, t1))
-    direction = xp.sign(t1 - t0)
+    direction, span = (t1 > t0) * 2.0 - 1.0, abs(t1 - t0)
+    fits = (span > 0) & (span < np.inf) & ((last - first) * direction >= 0)
     # times at an end of the span may lie beyond it by four units in the last place
-    slack = 4 * eps_of(ts) * xp.maximum(xp.abs(t0), xp.abs(t1))
-    from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
-    return (
-        (direction != 0)
-        & xp.isfinite(t1 - t0)
-        & xp.all((ts[1:] - ts[:-1]) * direction > 0)
-        & (from_start >= -slack)
-        & (to_end >= -slack)
-    )
+    for inside in ((first - t0) * direction, (t1 - last) * direction):
+        fits = fits & ((inside >= -4 * eps * abs(t0)) | (inside >= -4 * eps * abs(t1)))
+    return fits

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, real_type, static
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.scaling import row_scale
@@ -124,16 +125,29 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
     The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
     """
-    given_q = jnp.asarray(start.q)
-    u = jnp.asarray(start.u)
-    free = jnp.asarray(start.free_q)
-    usual = start.usual
-    q = given_q
-    here, at, begin = jax.lax.stop_gradient((scene, t, q))
+    q, u, usual = jnp.asarray(start.q), jnp.asarray(start.u), start.usual
+    near_q, g, guess, arrived = q, jnp.zeros(0, q.dtype), jnp.int32(0), jnp.array(True)
+    if len(usual.closures):
+        near_q, g, guess, arrived = _put_coordinates(scene, t, q, start, guesses)
+    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
+    left = jnp.concatenate([g, phi])
+    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
+    moved_q, moved_u, residual = (
+        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, jax.lax.stop_gradient(left))
+    )
+    names = scene.coordinate_names, scene.speed_names
+    moved = moved_q, moved_u, jnp.where(right, residual, jnp.inf)
+    return State(jnp.asarray(t), near_q, near_u, *moved, names, guess.astype(q.dtype)), arrived
+
+
+def _put_coordinates(scene: Scene, t, q, start: Guess, guesses) -> tuple[Array, Array, Count, Flag]:
+    """Return the nearest coordinates, the residual, the number of the guess, and whether q led to them."""
+    free, usual = jnp.asarray(start.free_q), start.usual
+    here, at, begin = stopped((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
     arrived = _arrived(begin, near_q, g, start)
     found = _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
-    if guesses is not None and len(usual.closures):
+    if guesses is not None:
         other = jax.lax.cond(
             eqxi.unvmap_any(~arrived),
             lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)),
@@ -144,16 +158,7 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
         q = jnp.where(better & free, found.begin, q)
     # derivatives of Newton's method from its starting point; without a solution they would diverge
     near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
-    near_q, guess = jnp.where(found.met, near_q, q), found.guess
-    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
-    left = jnp.concatenate([g, phi])
-    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
-    moved_q, moved_u, residual = (
-        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, jax.lax.stop_gradient(left))
-    )
-    names = scene.coordinate_names, scene.speed_names
-    moved = moved_q, moved_u, jnp.where(right, residual, jnp.inf)
-    return State(jnp.asarray(t), near_q, near_u, *moved, names, guess.astype(q.dtype)), arrived
+    return jnp.where(found.met, near_q, q), g, found.guess, arrived
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:

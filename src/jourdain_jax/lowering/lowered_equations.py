@@ -201,15 +201,11 @@ class Lowered:
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
-    def speeds_and_pivot(
-        self, fixed, t, q: Sequence, y: Sequence, inputs
-    ) -> tuple[Float[Array, "speeds *lanes"], PerLane]:
-        """Return all speeds and the smallest pivot, which changes sign where the elimination fails.
-
-        `fixed`, `q`, `y`, `inputs`: as in `rates`.
+    def speeds_and_pivot(self, *state) -> tuple[Float[Array, "speeds *lanes"], PerLane | None]:
+        """Return all speeds and the smallest pivot, which changes sign where the elimination fails; `state`:
+        as in `rates`.
         """
-        speeds = self.all_speeds(fixed, t, q, y, inputs)
-        return speeds, smallest_pivot(self.values(self.pivots, fixed, t, q, y, inputs))
+        return self.all_speeds(*state), smallest_pivot(self.values(self.pivots, *state))
 
     def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
         """Return all speeds, integrated and dependent. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
@@ -285,7 +281,11 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
     )
 
 
-def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane:
-    """Return the smallest magnitude of several numbers, at most 1, with the sign of their product."""
+def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane | None:
+    """Return the smallest magnitude of several numbers, at most 1, with the sign of their product; None
+    without numbers.
+    """
+    if not len(pivots):
+        return None
     pivots = jax.lax.stop_gradient(pivots)
     return jnp.prod(jnp.sign(pivots), axis=0) * jnp.min(jnp.abs(pivots), axis=0, initial=1.0)

@@ -15,10 +15,13 @@ phi_0 = 0:
 An omitted constraint then holds only if phi_0 is in the range of A.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import Flag, Scalar, eps_of
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.integrate.explicit_steps import off
@@ -53,35 +56,42 @@ def conserves(setup: Setup) -> bool:
     )
 
 
-def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
-    """Return T and V (J) at states, and again with each coordinate and speed increased by
-    the possible error of a step.
+def energies_near(
+    setup: Setup,
+    args,
+    states: tuple[Float[Array, "times"], Float[Array, "times rows"], Float[Array, "times inputs"]],
+    of_rows: Callable[[Array], Integrated],
+) -> tuple[Float[Array, "times 2"], Float[Array, "times 2"]]:
+    """Return T and V (J) at states, and again with each coordinate and speed increased by the possible error
+    of a step. A state: time, rows (for `of_rows`) and inputs.
     """
-    field, (*_, inputs, fixed, _) = setup.field, args
+    field, fixed = setup.field, args[3]
 
     def at(state):
-        t, y = state
-        here = Instant(setup.scene, fixed, t, y, inputs(t))
+        t, rows, inputs = state
+        here = Instant(setup.scene, fixed, t, of_rows(rows), inputs)
         if isinstance(field, ByProgram) and field.native:
             return field.native.energies(*here.of_program, *setup.tolerances).reshape(2, 2)
-        both = jax.tree.map(lambda x: jnp.stack([x, off(jnp.where, jnp.abs, x, *setup.tolerances)]), y)
-        return jax.lax.map(lambda y: field.energies(here._replace(y=y)), both)
+        both = jnp.stack([rows, off(jnp.where, jnp.abs, rows, *setup.tolerances)])
+        return jax.lax.map(lambda rows: field.energies(here._replace(y=of_rows(rows))), both)
 
     # loads of dense matrices may be callbacks without batching
-    states = jax.lax.stop_gradient((t, y))
+    states = stopped(states)
     found = jax.lax.map(at, states) if field.lowered is None else jax.vmap(at)(states)
-    return jnp.moveaxis(found, 1, 0)
+    return found[:, 0], found[:, 1]
 
 
-def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
-    """Return whether T + V changed by more than the errors of N `steps` explain."""
-    at, off = energies
-    T, V = at.T
-    E, error = T + V, jnp.sum(jnp.abs(off - at) + eps_of(at) * jnp.abs(at), axis=1)
-    most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # ignores NaN
-    return most[4] + most[5] > jnp.fmax(
-        diagnostics.DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3]
-    )
+def energy_lost(at: Float[Array, "times 2"], near: Float[Array, "times 2"], steps) -> Flag:
+    """Return whether T + V changed by more than the errors of N `steps` explain; `at`, `near`: from
+    `energies_near`.
+    """
+    error = jnp.sum(jnp.abs(near - at) + eps_of(at) * jnp.abs(at), axis=1, keepdims=True)
+    numbers = jnp.concatenate([at, jnp.sum(at, axis=1, keepdims=True)], axis=1)  # T, V, T + V
+    every = jnp.concatenate([numbers, -numbers, error], axis=1)
+    most = jnp.max(jnp.where(jnp.isnan(every), -jnp.inf, every), axis=0)
+    ranges = most[:3] + most[3:6]
+    allowed = jnp.stack([diagnostics.DRIFTED * (most[0] + ranges[1]), MOST_STEP_ERRORS * steps * most[6]])
+    return ranges[2] > jnp.max(allowed)
 
 
 def rows_violated(

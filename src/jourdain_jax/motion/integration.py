@@ -11,11 +11,13 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.compilation import RUN_SELDOM
-from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, at_index, eps_of, in_default_precision
+from jourdain_jax.calculus.derivatives import with_derivatives_of
+from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
 from jourdain_jax.integrate.inputs import Inputs, Mode, in_phases
@@ -48,13 +50,23 @@ def integrate(setup: Setup) -> Trajectory:
 
 
 def _one_motion(setup: Setup) -> Trajectory:
-    given = _in_contact(_with_machine_code(_prepared(setup)))
-    setup, asked = _entered(given)
-    timely = given.timely
-    begun, fitting = _begin(setup, timely), setup.fitting(timely)
-    if not setup.reason_against_machine_code:
-        begun = replace(begun, plain=_plain(given, timely))
+    given, fitting, asked, begun = _started(setup)
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
+
+
+def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
+    """Return the setup in the modes of its contacts; the same with marks, for a loop over steps; the zero of
+    the marks; and the start.
+    """
+    given = _in_contact(_with_machine_code(_prepared(setup)))
+    timely, (setup, asked) = given.timely, _entered(given)
+    if setup.reason_against_machine_code:
+        return given, setup.fitting(timely), asked, _begin(setup, timely)
+    plain = _plain(given, timely)
+    times, fixed, _ = lanes_first((plain.times, plain.args[3], asked))
+    times = with_derivatives_of(lambda _, times, timely: times.fitting(timely), times, setup.times, timely)
+    fixed = with_derivatives_of(lambda _, field, *of: field.fixed(*of), fixed, setup.field, setup.scene)
+    return given, setup.at(times), asked, _begin(setup, timely, fixed, plain)
 
 
 # The options minimise compile time; steps in machine code are not affected. A first motion of a disc takes
@@ -91,10 +103,7 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
     setups = eqx.filter_vmap(lane)(*varied)
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
         return eqx.filter_vmap(lambda *own: _one_motion(lane(*own)))(*varied)
-    given = eqx.filter_vmap(_in_contact)(_with_machine_code(_prepared(setups)))
-    setups, asked = eqx.filter_vmap(_entered)(given)
-    timely = eqx.filter_vmap(lambda setup: setup.timely)(given)
-    begun, fitting = eqx.filter_vmap(_begin)(setups, timely), eqx.filter_vmap(Setup.fitting)(setups, timely)
+    given, fitting, asked, begun = eqx.filter_vmap(_started)(setups)
     solved = setups.integrator.lanes_solved(fitting, begun)
     return eqx.filter_vmap(_finish)(given, fitting, asked, begun, solved)
 
@@ -111,12 +120,11 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     return eqx.tree_at(place, setup, eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
-def _plain(setup: Setup, timely: Flag) -> Plain:
+def _plain(setup: Setup, timely: Flag | np.bool_) -> Plain:
     """Return the numbers of a setup before `_entered`; numbers shared by all motions have no batch axis."""
-    setup = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, setup)
-    own = setup.fitting(timely)
-    times = {name: getattr(own, name) for name in ("ts", "t0", "t1", "dt0", "longest")}
-    return Plain(times, (None, None, setup.inputs, setup.field.fixed(setup.scene), setup.t0))
+    setup = stopped(setup)
+    fixed = setup.field.fixed(setup.scene)
+    return Plain(setup.times.fitting(timely), (None, None, setup.inputs, fixed, setup.t0))
 
 
 def _in_contact(setup: Setup) -> Setup:
@@ -138,13 +146,15 @@ def _in_contact(setup: Setup) -> Setup:
     )
 
 
-def _begin(setup: Setup, timely: Flag) -> Begun:
+def _begin(
+    setup: Setup, timely: Flag | np.bool_, fixed: tuple | None = None, plain: Plain | None = None
+) -> Begun:
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
     right, start = _without_faults(setup, start)
-    args = field, scene, setup.inputs, field.fixed(scene), setup.t0
-    return Begun(right, timely, start, args, field.pack(start.q, start.u))
+    args = field, scene, setup.inputs, field.fixed(scene) if fixed is None else fixed, setup.t0
+    return Begun(right, timely, start, args, field.pack(start.q, start.u), plain)
 
 
 def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Solved) -> Trajectory:
@@ -155,75 +165,72 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     transitions = solved.passed.times(origin, setup.ts, solved.ts, direction)
     inputs = in_phases(inputs, transitions, solved.passed.modes, direction)
     args = field, scene, inputs, fixed, origin
+    stores = field.with_work and field.of_inputs
+    stored_first = field.stored(scene, t0, start.q, inputs(t0)) if stores else None
     puts_back = field.projects and not integrator.own
-    stored_first = field.stored(scene, t0, start.q, inputs(t0))
-    sound = begun.timely & begun.right
-    valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & sound
+    sound = begun.right if begun.timely is np.True_ else begun.right & begun.timely
+    saved = solved.reached & (solved.ts * direction <= solved.t_end * direction) & sound
+    # unreached times may hold any value: compute at the end state, then mark as NaN
+    first, last, ys = begun.y0.rows, solved.y_end.rows, jax.vmap(lambda y: y.rows)(solved.ys)
+    ts = jnp.concatenate(
+        [jnp.zeros_like(last, shape=1), jnp.where(saved, solved.ts, solved.t_end), solved.t_end[None]]
+    )
+    rows = jnp.concatenate([first[None], jnp.where(saved[:, None], ys, last), last[None]])
 
-    def saved_state(tau, y, valid):
-        # unreached times may hold any value: compute at the end state, then mark as NaN
-        tau = jnp.where(valid, tau, solved.t_end)
-        y = jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
+    def at_state(tau, rows):
+        y = begun.y0.with_rows(rows)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
         _, at = integrands.at_time(tau, y, args)
         u, pivot = field.speeds_and_pivot(at)
-        work = None if y.work is None else y.work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
-        return (
-            jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)),
-            pivot,
-            (at.t, y),
-            step_errors(setup, free, y) if puts_back else None,
-        )
+        work = y.work
+        if stored_first is not None:
+            work = work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
+        found = jnp.concatenate([y.q, u, *([] if work is None else [work[None]])])
+        state = at.t, y.rows if puts_back else rows, at.inputs
+        return found, pivot, state, step_errors(setup, free, y) if puts_back else None
 
-    # append start and end to the saved states, so that this is compiled once
-    start_and_end = ((jnp.zeros_like(solved.t_end), begun.y0, sound), (solved.t_end, solved.y_end, sound))
-    all_states = jax.tree.map(
-        lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]),
-        (solved.ts, solved.ys, valid),
-        *start_and_end,
-    )
-    found, pivots, states, moved_by = jax.vmap(saved_state)(*all_states)
-    # Negative if A_z was singular along the motion; fmin ignores NaN, which marks a lost end. The
-    # barrier hides from XLA that all pivots are one without constraints, which it would otherwise
-    # evaluate for seconds while compiling.
-    pivots = jax.lax.optimization_barrier(pivots)
-    pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
-    pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
-    plain = begun.plain.args if begun.plain else args
-    lost = energy_lost(energies_near(setup, plain, *states), solved.accepted) if conserves(setup) else False
-    violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
-    drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
-    code = solved.code
-    for found_out, cause in (
-        (drifted, result_codes.OFF_CONSTRAINTS),
-        (lost, result_codes.ENERGY_LOST),
-        (violated, result_codes.CONTRADICTORY_ROWS),
-    ):
-        code = jnp.where((code <= result_codes.EVENT) & found_out, cause, code)
+    found, pivots, states, moved_by = jax.vmap(at_state)(ts, rows)
+    # negative if A_z was singular along the motion; NaN, which marks a lost end, is ignored
+    pivot = jnp.minimum(1.0, solved.pivot)
+    if pivots is not None:
+        pivots = jnp.append(pivots * jnp.sign(pivots[0]), pivot)
+        pivot = jnp.min(jnp.where(jnp.isnan(pivots), jnp.inf, pivots))
+    q, u, work = slice(n := len(start.q)), slice(n, m := n + len(start.u)), m
+    causes = []
+    if puts_back:
+        drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted)
+        causes.append((drifted, result_codes.OFF_CONSTRAINTS))
+    if conserves(setup):
+        plain = begun.plain.args if begun.plain else args
+        near = energies_near(setup, plain, states, begun.y0.with_rows)
+        causes.append((energy_lost(*near, solved.accepted), result_codes.ENERGY_LOST))
+    if field.rows_may_contradict:
+        violated = rows_violated(setup, states[0], found[:, q], found[:, u])
+        causes.append((violated, result_codes.CONTRADICTORY_ROWS))
     unwatched = reason_against_watching(setup)
-    result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
+    result = _result(setup, begun, solved, pivot, causes)
     failed = result > result_codes.EVENT
     # a failure that no step detected happened at an unknown time
     over = (result == result_codes.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > result_codes.EVENT)
     noticed = over | (result == solved.code) | (result == result_codes.NOT_FINITE)
-    beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states and of the end
+    beyond = failed & ~(noticed & jnp.append(saved, False))  # of the saved states and of the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
-    saved, treedef = jax.tree.flatten(at_index(found, slice(1, None)))
-    passed = jnp.where(jnp.isfinite(transitions), transitions, jnp.nan)
-    whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot, passed
-    marked = left(asked, [beyond] * len(saved) + [failed] * 4 + [jnp.zeros_like(failed)], [*saved, *whole])
-    q, u, work = jax.tree.unflatten(treedef, marked[: len(saved)])
-    t_end, moved_q, moved_u, pivot, passed = marked[len(saved) :]
+    t_end = t_end if begun.timely is np.True_ else jnp.where(begun.timely, t_end, given.t0)
+    known = jnp.append(saved, sound)  # the saved states and the end
+    found = jnp.where(known[:, None], found[1:], jnp.nan)
+    marked = [found, t_end, start.moved_q, start.moved_u, pivot, transitions]
+    marked = left(asked, [beyond] + [failed] * 4 + [jnp.zeros_like(failed)], marked)
+    found, t_end, moved_q, moved_u, pivot, passed = marked
     return Trajectory(
         scene=given.scene,
         ts=given.ts,
-        q=q[:-1],
-        u=u[:-1],
-        work=None if work is None else work[:-1],
+        q=found[:-1, q],
+        u=found[:-1, u],
+        work=found[:-1, work] if field.with_work else None,
         t_end=t_end,
-        q_end=q[-1],
-        u_end=u[-1],
+        q_end=found[-1, q],
+        u_end=found[-1, u],
         result=result,
         event=solved.event,
         accepted=solved.accepted,
@@ -248,14 +255,16 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
 def _phases(
     inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, names: tuple[str, ...], named: Modes
 ) -> Phases:
-    """Return the phases of a motion, which events at the times `ts` end."""
-    there = jnp.isfinite(ts)
+    """Return the phases of a motion, which events at the times `ts` end; infinite after the last one."""
     first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
-    modes = passed.modes if len(passed.modes) == len(first) else jnp.zeros((len(first), 0))
+    modes = passed.modes if len(passed.modes) == len(first) else np.zeros((len(first), 0))
     before = jnp.stack(first)[:, None] if first else jnp.zeros((0, 1))
+    if not len(ts):
+        return Phases(ts, passed.events, before, passed.lost, names, named)
+    there = jnp.isfinite(ts)
     modes = jnp.concatenate([before, jnp.where(there, modes, jnp.nan)], axis=1)
     events, lost = jnp.where(there, passed.events, -1), jnp.where(there, passed.lost, 0.0)
-    return Phases(ts, events, modes, lost, names, named)
+    return Phases(jnp.where(there, ts, jnp.nan), events, modes, lost, names, named)
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
@@ -266,36 +275,39 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     program = None if program is None or unsupported(program.graph, [program.right]) else program
     unneeded = setup.judged or (program is not None and not program.others)
-    others = jnp.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
+    others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
     if program is None:
         faults = faults_at(scene, *at, others)
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
     else:
-        nowhere = jnp.full(len(program.others), jnp.nan)
+        nowhere = np.full(len(program.others), jnp.nan)
         right = value_kernels.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
     return right, eqx.tree_at(
         lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u))
     )
 
 
-def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
-    """Return the result code, with the cause if known; earlier conditions take precedence."""
-    start, end = begun.start, solved.y_end
+def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
+    """Return the result code, with the cause if known; earlier conditions take precedence. `of_drift`:
+    conditions of motions that reached their end, with their codes.
+    """
+    start, end, code = begun.start, solved.y_end, solved.code
     eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     short = code == result_codes.STEP_TOO_SMALL
-    causes = (
+    arrived = code <= result_codes.EVENT
+    causes = [
         (~begun.right, result_codes.BAD_PARAMETER),
-        (~jnp.asarray(begun.timely), result_codes.BAD_TIMES),
+        *([] if begun.timely is np.True_ else [(~begun.timely, result_codes.BAD_TIMES)]),
         (~finite(start.q, start.u), result_codes.BAD_START),
-        (~(start.residual <= 1e3 * jnp.sqrt(eps)), result_codes.INCONSISTENT_START),
+        (~(start.residual <= 1e3 * np.sqrt(eps)), result_codes.INCONSISTENT_START),
         # a pivot that changed sign or is this small: independent speeds no longer determine the others
-        (jnp.asarray(pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION),
+        *([(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION)] if setup.field.needs_pivot else []),
         (~finite(end.q, end.v), result_codes.NOT_FINITE),
         (short & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED),
         # if no step succeeds, however short, the accelerations themselves are at fault
         (short & (solved.accepted == 0), result_codes.NOT_FINITE),
-    )
+        *((arrived & is_so, cause) for is_so, cause in of_drift),
+    ]
     # XLA repeats a chain of `where` in each derivative that is NaN after a failure, but not a reduction
-    noted = jnp.stack([is_so for is_so, _ in causes])
-    first = jnp.min(jnp.where(noted, jnp.arange(len(causes)), len(causes)))
-    return jnp.append(jnp.array([cause for _, cause in causes], jnp.int32), code.astype(jnp.int32))[first]
+    first = jax.lax.argmax(jnp.stack([*(is_so for is_so, _ in causes), jnp.array(True)]), 0, np.uint32)
+    return jnp.append(np.array([cause for _, cause in causes], np.int32), code)[first]

@@ -21,6 +21,7 @@ from jourdain_jax.calculus.reals import (
     all_finite,
     as_array,
     described,
+    eps_of,
     is_traced,
     known_numbers,
     nothing_is_traced,
@@ -32,7 +33,7 @@ from jourdain_jax.integrate.explicit_steps import DOPRI8, TSIT5, Method, Taylor,
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.integrate.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.integrate.own_steps import own_steps
-from jourdain_jax.integrate.setup import LONGEST, MEMORY, Setup, times_fit
+from jourdain_jax.integrate.setup import LONGEST, MEMORY, Setup, ends_fit
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.model import Model, modelled
@@ -166,7 +167,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
     constant = inputs.constant
-    t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
+    given_ts, (t0, ts, t1) = ts, span_and_times(scene, start, t0, t1, ts)
     if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
         raise ValueError(
             f"`{type(scene).__name__}` has contacts with friction, which cannot run back in "
@@ -200,7 +201,9 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     judged = model.once("judged", lambda: is_judged(scene))
     steps = tolerances, first_step, longest, integrator
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, *steps, usual, judged, model.decided)
+    apart = lambda: bool(abs(t1 - t0) > 1e3 * eps_of(t1) * abs(t1))  # else default times may coincide
+    fits = not is_traced(t0, t1, ts) and (given_ts is not None or apart())
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, *steps, usual, judged, fits, model.decided)
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
@@ -293,7 +296,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         )
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # in NumPy if concrete, without compilation
-    elif not known_numbers(times_fit(ts, t0, t1)).all():
+    elif ends and not is_traced(ts) and not _encloses(ends, ts):
         raise ValueError(
             f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
             f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose `ts`"
@@ -301,13 +304,19 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     return t0, ts, t1
 
 
+def _encloses(ends: list[float], ts: np.ndarray) -> bool:
+    """Return whether the span from one end to the other encloses the saved times."""
+    return bool(ends_fit(float(ts[0]), float(ts[-1]), ends[0], ends[1], float(eps_of(ts))))
+
+
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
     """Return the saved times, in NumPy if concrete. Raises ValueError unless they are a
     monotonic vector of finite numbers.
     """
     ts = vector_of_times(ts)
-    steps = np.diff(known_numbers(ts))
-    if not ((steps > 0).all() or (steps < 0).all()) or not all_finite(known_numbers(ts)):
+    known = known_numbers(ts)
+    steps = known[1:] - known[:-1]
+    if not ((steps > 0).all() or (steps < 0).all()) or not all_finite(known):
         raise ValueError(
             "`ts` must be finite and strictly increasing (or decreasing, for reversed time); "
             "sort it and drop repeated times"

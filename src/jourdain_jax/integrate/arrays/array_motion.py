@@ -32,7 +32,7 @@ def loop_of(
     method: Method | ImplicitMethod, setup: Setup, begun: Begun, of_events: dict[str, Any]
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion. `of_events`: the events of the form."""
-    goals, knots, field, y0 = setup.goals(setup.ts), setup.knots, setup.field, begun.y0
+    goals, knots, field, y0 = setup.times.goals, setup.knots, setup.field, begun.y0
     args, most, eps = (integrands.within(goals[0], begun.args), setup.most_steps(knots), float(eps_of(y0.q)))
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None

@@ -202,7 +202,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 
 def start_of(setup: Setup, begun: Begun) -> Start:
     """Return the arguments of a kernel for a motion."""
-    knots, goals = setup.knots, setup.goals(setup.ts)
+    knots, goals = setup.knots, setup.times.goals
     # zeros for sampled inputs, which are interpolated
     known, plain = (
         tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
@@ -297,11 +297,9 @@ def _samples(
 
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """Return the result of a loop as a `Solved`."""
-    h, code, accepted, rejected, event, pivot, crossings, count = found.rest[:8]
+    h, pivot, count = (found.rest[i] for i in (0, 5, 7))
     (states,), (end,), (t,), (log,) = found[:4]
-    code, accepted, rejected, event, crossings = (
-        x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings)
-    )
+    code, accepted, rejected, event, _, crossings = found.rest.astype(jnp.int32)[1:7]
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     ys = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1])
     code = code_at_end(code, h, accepted, t)

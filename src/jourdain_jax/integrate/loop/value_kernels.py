@@ -11,8 +11,8 @@ Each of these is separate machine code, compiled on request; the derivatives are
 programs that are too large, JAX differentiates the program run by XLA.
 
 Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies
-at saved states. XLA computes speeds of few operations (`lowering/lowered_equations.py`). Machine code saves
-XLA's tracing and compilation: a first motion of a disc takes 700 JAX operations instead of 1,070.
+at saved states. Machine code saves XLA's tracing and compilation. XLA computes derivatives of speeds of few
+operations (`lowering/lowered_equations.py`).
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -25,11 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jourdain_jax.calculus.derivative_errors import OtherDeviceError
-from jourdain_jax.calculus.derivatives import Rules, differentiated_as, filled, is_zero, with_rules
-from jourdain_jax.calculus.markers import entries_of, lanes_of
+from jourdain_jax.calculus.derivatives import (
+    Rules,
+    differentiated_as,
+    filled,
+    is_zero,
+    with_derivatives_of,
+    with_rules,
+)
+from jourdain_jax.calculus.markers import entries_of, lanes_of, stopped
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.loop.lanes import MachineWriter
@@ -308,9 +315,9 @@ class Beside:
     program: Lowered
     needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
     fixed: Callable[[Array], Array]  # function of those entries
-    speeds: Callable[..., Array] | None  # all speeds; None if XLA is faster
-    pivots: Callable[..., Array]  # like the energies, without derivatives
-    energies: Callable[..., Array]  # at a state, then at the state `off` it
+    speeds: Callable[..., Array]  # all speeds, for their derivatives
+    numbers: Callable[..., Array]  # all speeds and pivots, without derivatives
+    energies: Callable[..., Array]  # at a state, then at the state `off` it; without derivatives
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
     def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
@@ -320,10 +327,11 @@ class Beside:
             return self.program.fixed_values(scene)
         return entries_of(self.fixed(*parameters))
 
-    def speeds_and_pivot(self, fixed, t, q, y, inputs) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, *state) -> tuple[Speeds, Scalar | None]:
         """Return the values of `Lowered.speeds_and_pivot`."""
-        of = self.speeds or self.program.all_speeds
-        return of(fixed, t, q, y, inputs), smallest_pivot(self.pivots(fixed, t, q, y, inputs))
+        found, count = self.numbers(*state), len(self.program.speeds)
+        u = with_derivatives_of(lambda _, *state: self.speeds(*state), found[:count], *state)
+        return u, smallest_pivot(found[count:])
 
 
 @lru_cache(maxsize=64)
@@ -338,27 +346,20 @@ def beside(program: Lowered) -> Beside | None:
         tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters
     )
     given = [n for leaf in needed for n in leaf if n >= 0]
-    pivots, speeds = _at_state(program, program.pivots, nodes_called), None
+    every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
+    u = [every[i] for i in np.argsort([*program.independent, *program.dependent])]
+    numbers = _at_state(program, [*u, *program.pivots], nodes_called)
     state = {*program.traced.q.tolist(), *(int(program.traced.u[k]) for k in program.independent)}
     energies = _at_state(program, program.energies, partial(nodes_called, moved=state))
-    # Operations from which speeds are machine code. Measured, ms by XLA and here: one motion of 8 trailers
-    # (228 operations) 0.69 and 0.54, of 16 (436) 2.6 and 1.8, whose derivatives compile in 13 and 6 s; 256
-    # bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of 4 trailers (124) 44 and 39, their
-    # gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
-    if program.graph.operations(program.z) >= 100:
-        every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
-        speeds = _at_state(
-            program,
-            [every[i] for i in np.argsort([*program.independent, *program.dependent])],
-            values_of_nodes,
-        )
+    # Derivatives of speeds are machine code from 100 operations. Gradients, ms by XLA and here: 256 bicycles
+    # (460 operations) 85 and 72, 1,024 chains of 4 trailers (124) 111 and 108, 256 rattlebacks (70) 29, 42.
     return Beside(
         program,
         needed,
         values_of_nodes(graph, program.fixed, given),
-        speeds,
-        (lambda *state: pivots(*jax.lax.stop_gradient(state))) if program.pivots else lambda *_: jnp.zeros(0),
-        lambda *state: energies(*jax.lax.stop_gradient(state)),
+        _at_state(program, u, values_of_nodes) if graph.operations(program.z) >= 100 else program.all_speeds,
+        lambda *state: numbers(*stopped(state)),
+        lambda *state: energies(*stopped(state)),
         _at_state(program, program.at_start, values_of_nodes),
     )
 
@@ -370,11 +371,7 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
     run = function(
         program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]]
     )
-
-    def values(fixed, *others) -> Float[Array, "nodes"]:
-        return run(*(fixed[k] for k in which), *others)
-
-    return values
+    return lambda fixed, *others: run(*(fixed[k] for k in which), *others)
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:

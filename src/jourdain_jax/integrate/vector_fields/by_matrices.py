@@ -5,6 +5,7 @@ program, and for reductions chosen by the user.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, is_traced, static
@@ -178,7 +179,7 @@ class MinimalByMatrices(ByMatrices):
             if own
             else self.solved(at, known.u)[:2]
         )
-        v = found.udot[jnp.array(self.independent, jnp.int32)]
+        v = found.udot[np.array(self.independent, np.uint32)]
         return self.watched(
             at, motion, found, v, known.split.orientation()[None], jnp.zeros((0, len(known.u)))
         )
@@ -221,13 +222,11 @@ class FullByMatrices(ByMatrices):
     def speeds(self, at: Instant) -> Speeds:
         return at.y.v
 
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
         if not isinstance(self.reduction, Privileged | GibbsAppell):
-            return at.y.v, jnp.ones(())
-        return (
-            at.y.v,
-            bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction).pivot,
-        )
+            return at.y.v, None
+        found = bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction)
+        return at.y.v, found.pivot
 
     def rates_and_pivots(self, at: Instant) -> Watched:
         """Return `rates`, eliminated constraints, and 1 if the constraints determine the branch of the

@@ -121,6 +121,11 @@ class Integrated(eqx.Module):
         """Return all values as one array."""
         return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
 
+    def with_rows(self, rows: Float[Array, "rows *lanes"]) -> "Integrated":
+        """Return a state of as many coordinates and speeds with other values."""
+        q, v, *work = jnp.split(rows, np.cumsum([len(self.q), len(self.v)]))
+        return Integrated(q, v, rows[-1] if len(work[0]) else None)
+
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
         """Return the state from these rows; `form` gives the numbers of coordinates and speeds."""
@@ -224,15 +229,13 @@ class VectorField(eqx.Module):
 
     def pack(self, q, u) -> Integrated:
         """Return the integrated state of (q, u)."""
-        v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
+        v = u if self.independent is None else u[np.array(self.independent, np.uint32)]
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def stored(self, scene: Scene, t, q, inputs) -> Scalar:
         """Return the energy (J) stored in loads whose potential depends on inputs. Integrated work plus the
         change of this energy is the work done.
         """
-        if not (self.with_work and self.of_inputs):
-            return jnp.zeros((), q.dtype)
         return stored_by_inputs(
             scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs
         )
@@ -242,11 +245,12 @@ class VectorField(eqx.Module):
         """Return all speeds."""
 
     @abc.abstractmethod
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
         """Return all speeds, and a measure of how well the independent ones determine the others. The measure
         changes its sign where they do not.
 
-        For the full state it is the measure of the reduction, without a sign, or 1 if there is none.
+        For the full state it is the measure of the reduction, without a sign. It is None if nothing is
+        eliminated.
         """
 
     def motion(self, at: Instant) -> Motion:
@@ -341,10 +345,9 @@ class ByProgram(VectorField):
         return (self.native or self.program).fixed_values(scene)
 
     def speeds(self, at: Instant) -> Speeds:
-        return self.program.speeds_and_pivot(*at.of_program)[0]
+        return self.program.all_speeds(*at.of_program)
 
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
-        """Return all speeds, and the smallest pivot of the elimination."""
+    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
         return (self.native or self.program).speeds_and_pivot(*at.of_program)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
