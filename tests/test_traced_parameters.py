@@ -221,6 +221,10 @@ def test_parameters_that_no_lane_varies_and_no_fit_frees_keep_their_numbers():
     lanes = jj.rollout(scene, start, parameters={"mass": jnp.array([1.0, 2.0])}, **OPTIONS).lanes
     assert_allclose(lanes.q, [alone.q, alone.q], atol=1e-8)
     assert jj.diagnose(alone).energy_drift < 1e-8
+    x, y, speed = alone["x"], alone["y"] - 1.0, np.hypot(alone["x_rate"], alone["y_rate"])
+    pull = 1.3 * (speed**2 - 9.81 * y)  # N, along the rod of 1 m
+    force = alone.constraint_forces().forces_on("mass")["rod"]
+    assert_allclose(force[:, :2], -pull[:, None] * jnp.stack([x, y], axis=1), atol=1e-7)
     data = [jj.Experiment(OPTIONS["ts"], {"x": alone["x"] + off}, 0.01, start=start) for off in (0.0, 0.02)]
     right, off = (log_density(scene, x, free=("mass",)) for x in data)
     assert_allclose(right(right.initial) - off(off.initial), 3 * 0.5 * 2.0**2, rtol=1e-3)

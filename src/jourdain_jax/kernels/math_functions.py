@@ -24,7 +24,7 @@ from jourdain_jax.kernels.angles import WHOLE, polynomial, product_less, quotien
 from jourdain_jax.kernels.ir import Writer
 from jourdain_jax.kernels.ir_value import Value
 
-DoubleDouble = tuple[Value, Value]  # head and low part
+DoubleDouble = angles.DoubleDouble
 _LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # the first has 32 bits
 _THIRD = (1 / 3, 1.850371707708594e-17)
 EXP = (
