@@ -296,7 +296,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         )
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # in NumPy if concrete, without compilation
-    elif ends and not is_traced(ts) and not _encloses(ends, ts):
+    elif ends and len(known := known_numbers(ts)) and not _encloses(ends, known):
         raise ValueError(
             f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
             f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose `ts`"

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole, is_traced
+from jourdain_jax.calculus.reals import Entries, all_finite, array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.assembly import ENOUGH, Assembled, coordinate_bounds, random_states
@@ -92,8 +92,10 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "gue
     low, high = coordinate_bounds(scene)
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
     near, width = 0.1 * (elsewhere[:GUESSES] - (low + high) / 2), np.where(high > low, high - low, 1.0)
-    given = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q), states, near, elsewhere[GUESSES:]
-    return (_traced_guesses if is_traced(q) else _guesses)(array_module(q), *given, free, width)
+    on, others = array_module(q), (states, near, elsewhere[GUESSES:], free, width)
+    if on is np:
+        return _guesses(np, np.asarray(q), *others)
+    return _traced_guesses(on, jax.lax.stop_gradient(q), *others)
 
 
 def _guesses(
