@@ -260,7 +260,8 @@ def _phases(
     modes = passed.modes if len(passed.modes) == len(first) else np.zeros((len(first), 0))
     before = jnp.stack(first)[:, None] if first else jnp.zeros((0, 1))
     if not len(ts):
-        return Phases(ts, passed.events, before, passed.lost, names, named)
+        events, lost = jnp.asarray(passed.events), jnp.asarray(passed.lost)
+        return Phases(ts, events, before, lost, names, named)
     there = jnp.isfinite(ts)
     modes = jnp.concatenate([before, jnp.where(there, modes, jnp.nan)], axis=1)
     events, lost = jnp.where(there, passed.events, -1), jnp.where(there, passed.lost, 0.0)
