@@ -88,7 +88,7 @@ OTHERS = sorted(set(jj.models.MODELS) - {"tilting-disc", "whipple-bicycle"})
 
 
 def functions_of(of: str) -> dict[str, Callable]:
-    """Values, a tangent and a gradient of a model's motion, as functions of what is spread."""
+    """Return values, a tangent and a gradient of a model's motion, as functions of the varied number."""
     if of in KINDS:
         return {name: function for name, (_, function) in KINDS[of].items()}
     from ends_of_models import end_of_model
@@ -100,7 +100,7 @@ def functions_of(of: str) -> dict[str, Callable]:
 
 
 def spread(of: str, lanes: int) -> jax.Array:
-    """Numbers of so many lanes."""
+    """Return the number of each lane."""
     return jnp.linspace(*SPREAD.get(of, (0.0, 0.01)), lanes)
 
 
@@ -256,13 +256,11 @@ def twin(of: str, name: str, quick: bool) -> Figures:
         yield figure(
             f"arrays that differ, threads of a GPU on the CPU {order}, {name}", f"7 lanes, {of}", differ, 0
         )
-    text = max(texts, key=len)
     for architecture in ("sm_75", "sm_80", "sm_90", "sm_100"):
-        ptx = nvidia.text_for(text, architecture)
-        yield figure(
-            f"undefined functions for {architecture}, {name}", of, len(re.findall(r"^\.extern", ptx, re.M)), 0
-        )
-        if architecture == "sm_90" and (said := gpu_twin.said_by_assembler(ptx)):
+        every = [nvidia.text_for(text, architecture) for text in texts]
+        missing = sum(len(re.findall(r"^\.extern", ptx, re.M)) for ptx in every)
+        yield figure(f"undefined functions for {architecture}, {name}", of, missing, 0)
+        if architecture == "sm_90" and (said := "".join(map(gpu_twin.said_by_assembler, every))):
             for what, pattern in {
                 "registers": r"Used (\d+) r",
                 "bytes of stack": r"(\d+) bytes stack",
@@ -317,7 +315,7 @@ def with_gpu() -> tuple[dict, list[str]]:
 
 
 def in_time(name: str, part: Callable, until: float) -> Callable:
-    """A part that does not begin after a time."""
+    """Return a part that does not begin after a time."""
 
     def run(quick: bool) -> Figures:
         if time.monotonic() > until:

@@ -15,7 +15,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 474_061,
+    "code tokens of src": 474_059,
     "code tokens of docs": 11_517,
     "code tokens of notebooks": 7459,
     "caches": 49,
@@ -28,7 +28,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, its event search and its adjoint": 1,
     "code tokens of tests": 333_467,
-    "code tokens of bench": 108_068,
+    "code tokens of bench": 108_081,
     "test files that reach private names": 34,
 }
 

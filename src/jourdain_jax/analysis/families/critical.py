@@ -191,10 +191,10 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. X is
     NaN unless the code is 0.
 
-    Parameters change linearly from the family's to the given ones, first in one step. A step is taken if
-    each of three corrections of Newton's method is at most 0.3 of the one before, which by the theorem of
-    Newton and Kantorovich leaves one solution nearby; otherwise it is shortened. The point is found once the
-    next correction would be below 1e-7.
+    Parameters change linearly from the family's to the given ones, first in one step. A step is accepted if
+    each of three corrections of Newton's method is at most 0.3 of the one before; otherwise it is shortened.
+    Such corrections stay near the start, so that they cannot lead to another point. The point is found once
+    the next correction, at the rate of the last two, would be below 1e-7.
     """
     zero, none = jnp.array(0.0), jnp.array(0)
     start = _Followed(special.normal(special.X), zero, zero + 1, none, jnp.array(False))
