@@ -48,7 +48,7 @@ class Sleigh(jj.Scene):
     coordinates = jj.coordinates("x y heading")  # x, y of the mass centre
 
     def bodies(self, t, q):
-        position = jnp.stack([q.x, q.y, 0.0 * q.x])
+        position = jj.vec(q.x, q.y, 0)
         return {"sleigh": jj.RigidBody(self.mass, self.inertia * jnp.ones(3), position, jj.rot_z(q.heading))}
 
     def velocity_constraints(self, motion):

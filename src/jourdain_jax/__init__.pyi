@@ -12,6 +12,7 @@ from .analysis.steady import steady
 from .analysis.verify import verify
 from .calculus.derivative_errors import DifferentiationModeError
 from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
+from .calculus.vectors import vec
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from .dynamics.newton_euler import newton_residual
 from .equations.kinematics import motion_at, pose_at
@@ -186,6 +187,7 @@ __all__ = [
     "structure_of",
     "studies",
     "torque",
+    "vec",
     "verify",
     "virtual_power",
     "weld",

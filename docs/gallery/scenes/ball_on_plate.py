@@ -42,7 +42,7 @@ class BallOnPlate(jj.Scene):
 
     def bodies(self, t, q):
         plate = jj.rot_x(q.roll) @ jj.rot_y(q.pitch)
-        on_plate = plate @ jnp.stack([q.x, q.y, self.radius + 0.0 * q.x])
+        on_plate = plate @ jj.vec(q.x, q.y, self.radius)
         corners = jnp.array(
             [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]
         )

@@ -48,7 +48,7 @@ class CarWithTrailers(jj.Scene):
         }
 
     def bodies(self, t, q):
-        car, axle = jj.rot_z(q.heading), jnp.stack([q.x, q.y, 0.0 * q.x])
+        car, axle = jj.rot_z(q.heading), jj.vec(q.x, q.y, 0)
         middle = axle + 0.5 * self.wheelbase * car[:, 0]
         made = {"car": jj.RigidBody.box(self.car_mass, (3.6, 1.0, 0.8), position=middle, orientation=car)}
         for name, side in (("left", 0.5), ("right", -0.5)):

@@ -7,8 +7,6 @@ R_t^2 = R^2 + hitch^2 - tongue^2. Source: C. Altafini, Int. J. Robotics Research
 hitches).
 """
 
-import jax.numpy as jnp
-
 import jourdain_jax as jj
 
 LOOK = (
@@ -42,9 +40,8 @@ class RobotWithTrailer(jj.Scene):
     example_span = 8.0
 
     def bodies(self, t, q):
-        o = 0.0 * q.x
         hull, trailer = jj.rot_z(q.heading), jj.rot_z(q.trailer)
-        axle = jnp.stack([q.x, q.y, o + self.radius])
+        axle = jj.vec(q.x, q.y, self.radius)
         cart = axle - self.hitch * hull[:, 0] - self.tongue * trailer[:, 0]
         made = {"hull": jj.RigidBody.box(self.hull_mass, (0.4, 0.26, 0.14), position=axle, orientation=hull)}
         for name, side in (("left", 0.5), ("right", -0.5)):

@@ -41,7 +41,7 @@ class RollerRacer(jj.Scene):
     example_span = 6.0
 
     def bodies(self, t, q):
-        seat, axle = jj.rot_z(q.heading), jnp.stack([q.x, q.y, 0.0 * q.x])
+        seat, axle = jj.rot_z(q.heading), jj.vec(q.x, q.y, 0)
         bar = seat @ jj.rot_z(q.handlebar)
         casters = axle + self.ahead * seat[:, 0] - self.behind * bar[:, 0]
         return {

@@ -40,7 +40,7 @@ class SphericalRobot(jj.Scene):
     example_span = 5.0
 
     def bodies(self, t, q):
-        shell, centre = jj.quaternion_to_matrix(q.attitude), jnp.stack([q.x, q.y, self.radius + 0.0 * q.x])
+        shell, centre = jj.quaternion_to_matrix(q.attitude), jj.vec(q.x, q.y, self.radius)
         arm = shell @ jj.rot_y(q.pendulum)
         rod = self.length * jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
         return {

@@ -6,8 +6,6 @@ R = wheelbase / tan(d), the front wheel at sqrt(R^2 + wheelbase^2)/r. Source: R.
 Autonomous Mobile Robots (2004), 3.2.
 """
 
-import jax.numpy as jnp
-
 import jourdain_jax as jj
 
 LOOK = (
@@ -41,9 +39,9 @@ class Tricycle(jj.Scene):
     example_span = 6.0
 
     def bodies(self, t, q):
-        frame, o = jj.rot_z(q.heading), 0.0 * q.x
-        axle, fork = jnp.stack([q.x, q.y, o + self.radius]), frame @ jj.rot_z(q.steer)
-        centre = axle + self.ahead * frame[:, 0] + jnp.stack([o, o, o + self.height - self.radius])
+        frame = jj.rot_z(q.heading)
+        axle, fork = jj.vec(q.x, q.y, self.radius), frame @ jj.rot_z(q.steer)
+        centre = axle + self.ahead * frame[:, 0] + jj.vec(0, 0, self.height - self.radius)
         made = {
             "frame": jj.RigidBody.box(self.frame_mass, (0.9, 0.5, 0.4), position=centre, orientation=frame)
         }

@@ -5,8 +5,6 @@ Upright at rest and without a controller the pitch grows like exp(s t), s^2 = m 
 Grasser et al., IEEE Trans. Ind. Electron. 49 (2002) 107.
 """
 
-import jax.numpy as jnp
-
 import jourdain_jax as jj
 
 LOOK = (
@@ -43,7 +41,7 @@ class TwoWheeledPendulum(jj.Scene):
     example_span = 6.0
 
     def bodies(self, t, q):
-        level, axle = jj.rot_z(q.heading), jnp.stack([q.x, q.y, self.radius + 0.0 * q.x])
+        level, axle = jj.rot_z(q.heading), jj.vec(q.x, q.y, self.radius)
         body = level @ jj.rot_y(q.pitch)
         made = {
             "body": jj.RigidBody.box(

@@ -45,7 +45,7 @@ class Unicycle(jj.Scene):
 
     def bodies(self, t, q):
         frame = jj.rot_z(q.yaw) @ jj.rot_x(q.lean)
-        hub, rider = jnp.stack([q.x, q.y, 0.0 * q.x]) + self.radius * frame[:, 2], frame @ jj.rot_y(q.pitch)
+        hub, rider = jj.vec(q.x, q.y, 0) + self.radius * frame[:, 2], frame @ jj.rot_y(q.pitch)
         rim = self.wheel_mass * self.radius**2
         spun = frame @ jj.rot_y(q.spin)
         outline = self.height * jnp.array(

@@ -8,6 +8,7 @@ from jourdain_jax.analysis.derivative_checks import derivative_exists
 from jourdain_jax.analysis.energy import Energy, EnergyBalance
 from jourdain_jax.analysis.linearize import Linearization
 from jourdain_jax.analysis.report import Report
+from jourdain_jax.analysis.state_space import StateSpace
 from jourdain_jax.analysis.steady import SteadyMotion
 from jourdain_jax.analysis.verification import Verification
 
@@ -16,6 +17,7 @@ __all__ = [
     "EnergyBalance",
     "Linearization",
     "Report",
+    "StateSpace",
     "SteadyMotion",
     "Verification",
     "derivative_exists",

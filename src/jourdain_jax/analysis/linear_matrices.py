@@ -47,6 +47,7 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     found = dict(zip(("M", "C", "K", "F", "coupling"), second, strict=True))
     found |= {"A": A, "B": B, "acceleration": largest(v[constant]), "pivot": xp.minimum(*pivots)}
     found["residual"] = xp.maximum(found["acceleration"], largest(change))
+    found["followed"] = T
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 

@@ -20,14 +20,17 @@ from jourdain_jax.analysis.families.eigenvalue_derivatives import Sensitivities,
 from jourdain_jax.analysis.families.spectrum import mode_names
 from jourdain_jax.analysis.linear_matrices import matrices_of, own_rate
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
+from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
 from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
+    perturbations,
     perturbed_names,
     privileged_at,
     privileged_speeds,
 )
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, holds, is_traced, static
+from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.state_projection import State
@@ -74,6 +77,8 @@ class Linearization(Printed, eqx.Module):
     # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent speeds or
     # coordinates
     pivot: Scalar
+    # of coordinates, speeds and inputs, along the independent ones: states, then inputs
+    followed: Float[Array, "all independent"]
     states: Labels = static()  # names of the entries of x
     inputs: Labels = static()
     coordinates: Labels = static()  # names of p
@@ -150,6 +155,48 @@ class Linearization(Printed, eqx.Module):
         appear as 1e-8. `eigenvalues` omits them.
         """
         return _roots(self.A)
+
+    def state_space(self, outputs: Outputs = None) -> StateSpace:
+        """Return dx/dt = A x + B f, y = C x + D f with the named outputs y.
+
+            small.state_space("lean yaw_rate")
+            small.state_space({"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))[1]})
+
+        `outputs`: names of coordinates and speeds, also dependent ones, or name -> function of a `Motion`
+        (one instant) that returns one number; default: the states. Raises ValueError for an unknown name.
+        """
+        scene, state, f = self.about
+        count, (S, turned) = len(self.states), perturbations(scene)
+        n, m = S.shape[1], len(state.u)
+
+        def slope(of, x):
+            dq = (S + turned @ state.q) @ x[:n]
+            at = lambda q, u, f: of(motion_at(scene, state.t, q, u, f))
+            return jax.jvp(at, (state.q, state.u, f), (dq, x[n : n + m], x[n + m :]))[1]
+
+        names, rows = outputs_of(
+            outputs, (*perturbed_names(scene), *scene.speed_names.entries), self.followed, slope, self.states
+        )
+        C, D = rows[:, :count], rows[:, count:]
+        return StateSpace(self.A, self.B, C, D, self.states, self.inputs, names, type(scene).__name__)
+
+    def to_control(self, outputs: Outputs = None):
+        """Return `state_space(outputs)` as `control.ss` of python-control, with all names. Raises ImportError
+        without python-control.
+        """
+        return self.state_space(outputs).to_control()
+
+    def minimal(self, outputs: Outputs = None) -> StateSpace:
+        """Return `state_space(outputs)` without ignorable states and uncontrollable modes, for instance for a
+        regulator; `states` has the names of those kept, and `outputs` (default) as well.
+
+        Omitted are states on which no speed and no given output depends, directly or through others: x, y and
+        yaw of a bicycle. Omitted are also states that follow from others when the inputs alone move the
+        scene: its forward speed, or one of two equal pendulums on one cart. The motion that only initial
+        values excite is lost, also if it grows: compare `state_eigenvalues`.
+        """
+        first = sum(name not in self.about[0].speed_names.entries for name in self.states)
+        return minimal(self.state_space(outputs), first, outputs is not None)
 
     def _companion(self) -> Float[Array, "modes modes"]:
         k = len(self.coordinates)

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
@@ -115,12 +116,12 @@ class ChaplyginSleigh(Scene):
         return {"heading and slide": self.offset * motion.q.heading - k * turned}
 
     def _blade(self) -> Vector3:
-        return jnp.stack([-self.offset, 0 * self.offset, 0 * self.offset])
+        return vec(-self.offset, 0, 0)
 
 
 def _level(mass, inertia, x, y, orientation) -> RigidBody:
     """Return a body that stays level; only its moment of inertia about z matters."""
-    return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
+    return RigidBody(mass, inertia * jnp.ones(3), vec(x, y, 0), orientation)
 
 
 def _edge(body, point=None) -> Scalar:

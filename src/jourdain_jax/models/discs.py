@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact.contacts import disc_contact
@@ -93,7 +94,7 @@ class TiltingDisc(_ThinDisc):
 
     def bodies(self, t, q):
         frame = rot_z(q.yaw) @ rot_x(q.lean)
-        centre = jnp.stack([q.x, q.y, 0.0 * q.x]) + self.radius * frame[:, 2]
+        centre = vec(q.x, q.y, 0) + self.radius * frame[:, 2]
         return self._disc(centre, frame @ rot_y(q.spin))
 
     def contacts(self, pose):

@@ -5,6 +5,7 @@ velocities.
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Parameter
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.contact.grounds import tangents_of
@@ -50,7 +51,7 @@ class RosenbergParticle(_OnSheets):
         return {"sheet": motion.u.z_rate - motion.q.y * motion.u.x_rate}
 
     def visuals(self, pose):
-        return self._with_plane(jnp.stack([-pose.q.y, 0.0 * pose.q.y, 1.0 + 0.0 * pose.q.y]))
+        return self._with_plane(vec(-pose.q.y, 0, 1))
 
     def invariants(self, motion):
         return {
@@ -79,7 +80,7 @@ class HeisenbergParticle(_OnSheets):
         return {"contact form": u.z_rate - q.y * u.x_rate + q.x * u.y_rate}
 
     def visuals(self, pose):
-        return self._with_plane(jnp.stack([-pose.q.y, pose.q.x, 1.0 + 0.0 * pose.q.x]))
+        return self._with_plane(vec(-pose.q.y, pose.q.x, 1))
 
     def invariants(self, motion):
         return {"x rate": motion.u.x_rate, "y rate": motion.u.y_rate, "z rate": motion.u.z_rate}
@@ -113,7 +114,7 @@ class IsokineticParticle(Heavy):
         return {"x_rate": self.speed}
 
     def bodies(self, t, q):
-        return {"particle": Particle(self.mass, jnp.stack([q.x, jnp.zeros_like(q.x), q.z]))}
+        return {"particle": Particle(self.mass, vec(q.x, 0, q.z))}
 
     def velocity_constraints(self, motion):
         v = motion["particle"].velocity

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.constraints import rod
@@ -64,7 +65,7 @@ class DoublePendulumAngles(_DoublePendulum):
 
 def _along(angle) -> Vector3:
     """Return the unit vector at `angle` from straight down, in the x-z plane."""
-    return jnp.stack([jnp.sin(angle), jnp.zeros_like(angle), -jnp.cos(angle)])
+    return vec(jnp.sin(angle), 0, -jnp.cos(angle))
 
 
 class DoublePendulumRods(_DoublePendulum):
@@ -106,8 +107,7 @@ class DoublePendulumRods(_DoublePendulum):
 
 def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Particle]:
     """Return two particles at Cartesian coordinates in the x-z plane."""
-    level = jnp.zeros_like(q.x1)
-    first, second = jnp.stack([q.x1, level, q.z1]), jnp.stack([q.x2, level, q.z2])
+    first, second = vec(q.x1, 0, q.z1), vec(q.x2, 0, q.z2)
     return {"first": Particle(scene.mass1, first), "second": Particle(scene.mass2, second)}
 
 
@@ -214,8 +214,7 @@ class PendulumChain(Heavy):
 
     def bodies(self, t, q):
         masses = self._per_link(self.mass)
-        level = jnp.zeros_like(q.x1)
-        places = {i: jnp.stack([q[f"x{i}"], level, q[f"z{i}"]]) for i in range(1, self.links + 1)}
+        places = {i: vec(q[f"x{i}"], 0, q[f"z{i}"]) for i in range(1, self.links + 1)}
         return {f"particle {i}": Particle(masses[i - 1], place) for i, place in places.items()}
 
     def geometric_constraints(self, pose):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Matrix3, Parameter, Vector3
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact.contacts import ball_contact, ellipsoid_contact
@@ -170,7 +171,7 @@ class Rattleback(Heavy):
         return jnp.stack([self.a, self.b, self.c])
 
     def _below_centre(self) -> Vector3:
-        return jnp.stack([0 * self.h, 0 * self.h, self.h])
+        return vec(0, 0, self.h)
 
     def _inertia(self) -> Matrix3:
         o = jnp.zeros_like(self.A)

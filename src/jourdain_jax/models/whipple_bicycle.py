@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import Matrix3, Parameter, Scalar, Vector3, real_type
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
+from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs
@@ -126,7 +127,7 @@ class WhippleBicycle(Scene):
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
 
     def bodies(self, t, q):
-        contact = jnp.stack([q.x, q.y, 0.0 * q.x])
+        contact = vec(q.x, q.y, 0)
         wheel_plane = rot_z(q.yaw) @ rot_x(q.lean)
         rear = wheel_plane @ rot_y(q.pitch)
         # about the steer axis (sin lam, 0, -cos lam) by +steer: about its opposite, the z axis tilted back,
@@ -212,8 +213,7 @@ class WhippleBicycle(Scene):
 
 def _vector(x, z) -> Vector3:
     """Return the vector (x, z) of the plane of symmetry, z down, in the engine's axes: (x, 0, -z)."""
-    x, z = jnp.asarray(x), jnp.asarray(z)
-    return jnp.stack([x, jnp.zeros_like(x), -z])
+    return vec(x, 0, -z)
 
 
 def _inertia(xx, yy, zz, xz) -> Matrix3:

@@ -188,7 +188,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
         return tuple(range(count))
     subsets = list(itertools.islice(itertools.combinations(range(count), rank), 3001))
     if len(subsets) > 3000:
-        subsets = list({_greedy(A, rank) for A in scaled})
+        subsets = list({pivot_columns(A, rank) for A in scaled})
 
     def merit(dependent, probes):
         pivots = pivots_at(probes, list(dependent), rank)
@@ -201,7 +201,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
     return tuple(i for i in range(count) if i not in dependent)
 
 
-def _greedy(A: np.ndarray, rank: int) -> Indices:
+def pivot_columns(A: np.ndarray, rank: int) -> Indices:
     """Return the columns that pivoted QR chooses: in turn, the one with the largest remaining length."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):
