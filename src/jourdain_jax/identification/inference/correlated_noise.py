@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import Entries, Scalar
+from jourdain_jax.calculus.reals import Entries
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.solve.arrow import Arrow, PerMember, eliminated
 
@@ -157,13 +157,13 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
-def log_density(r, weight, ts, tau) -> Scalar:
-    """Return the logarithm of the density of `r` in units of sigma, without the term `log(sigma sqrt(2 pi))`:
-    `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`, for JAX arrays.
+def log_densities(r, weight, ts, tau) -> Float[Array, "times *channel"]:
+    """Return the logarithm of the density of each sample of `r` in units of sigma, given those before it,
+    without the term `log(sigma sqrt(2 pi))`: `- w^2 / 2 - log sqrt(1 - rho^2)`, for JAX arrays.
 
     r, weight: (times, *channel); a weight of zero marks a missing sample.
     """
     before, gap = chain(weight, ts, jnp)
     rho = memory(gap, tau, jnp)
     w = whitened(r, jnp.take_along_axis(r, before, axis=0), rho)
-    return -0.5 * jnp.sum(jnp.where(weight > 0, w**2 + jnp.log1p(-(rho**2)), 0.0))
+    return -0.5 * jnp.where(weight > 0, w**2 + jnp.log1p(-(rho**2)), 0.0)

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.identification.data.experiment import Data
-from jourdain_jax.identification.inference.correlated_noise import log_density
+from jourdain_jax.identification.inference.correlated_noise import log_densities
 from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, check_known
 from jourdain_jax.identification.solve.run_groups import equal_runs
 from jourdain_jax.identification.solve.run_residuals import Run
@@ -54,22 +54,31 @@ def log_likelihood(
 
 def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Scalar:
     """Return the logarithm of the density of the measurements of one run; -inf if its motion fails."""
-    found = jnp.zeros(())
+    found = sum(map(jnp.sum, of_samples(scene, run, options=options).values()), jnp.zeros(()))
+    return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+
+def of_samples(scene: Scene, run: Run, *, options: AllOptions) -> dict[str, Array]:
+    """Return the logarithm of the density of each sample by channel: zero for a missing one, and given the
+    samples before it if noise is correlated.
+    """
+    found = {}
     for name, r in run.residuals(scene, simulate, options).items():
         weight = run.weights[name]
         counted = weight > 0
         # log sigma = - log weight
         logs = jnp.log(jnp.where(counted, weight, 1.0) / jnp.sqrt(2 * jnp.pi))
         tau = run.correlation_time.get(name)
-        of_r = jnp.sum(-0.5 * r**2) if tau is None else log_density(r, weight, run.ts, tau)
-        found = found + jnp.sum(jnp.where(counted, logs, 0.0)) + of_r
-    return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+        of_r = -0.5 * r**2 if tau is None else log_densities(r, weight, run.ts, tau)
+        found[name] = jnp.where(counted, logs, 0.0) + of_r
+    return found
 
 
-def mapped(f: Callable, runs: Run, *more: Array) -> Array:
+def mapped(f: Callable, runs: Run, *more: Array):
     """Return `f(run, *more)` for each of the stacked runs. A single run is not batched, since batches use
     wider, slower registers.
     """
     if runs.ts.shape[0] > 1:
         return eqx.filter_vmap(f)(runs, *more)
-    return f(*jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, (runs, *more)))[None]
+    found = f(*jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, (runs, *more)))
+    return jax.tree.map(lambda x: x[None], found)

@@ -20,13 +20,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.compilation import compiled
+from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Scalar, holds, is_traced, real_type, static
 from jourdain_jax.identification.data.estimate import Estimate, Range, positive
 from jourdain_jax.identification.data.experiment import Data
 from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits
 from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, in_all_or_none
-from jourdain_jax.identification.inference.likelihood import mapped, of_run
-from jourdain_jax.identification.report.fit_result import Fit
+from jourdain_jax.identification.inference.likelihood import mapped, of_run, of_samples
+from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.solve.body_inertia import PossibleInertia
 from jourdain_jax.identification.solve.layout import Layout
 from jourdain_jax.identification.solve.run_groups import equal_runs
@@ -88,12 +89,18 @@ class LogDensity(eqx.Module):
             + self.prior_height
             - 0.5 * known @ known
         )
+        with reference.stands_in():
+            return logs + sum(map(jnp.sum, self._of_runs(theta, of_run)))
+
+    def _of_runs(self, theta: Point, of: Callable) -> list:
+        """Return `of(scene, run)` of all runs, stacked by group."""
+        count, end = len(self.places), len(self.places) + len(self.sigmas)
         shared, local = self._split(theta)
         scene = self.layout.scene(self.scene, shared)
         sigma = dict(zip(self.sigmas, theta[count:end], strict=True))
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
 
-        def one(run: Run, local: Float[Array, "local"]) -> Scalar:
+        def one(run: Run, local: Float[Array, "local"]):
             here = run.at(self.layout, shared, local)
             weights = {
                 name: weight / sigma[name] if name in sigma else weight
@@ -102,15 +109,14 @@ class LogDensity(eqx.Module):
             memory = here.correlation_time | {
                 name: tau[name] for name in here.correlation_time if name in tau
             }
-            return of_run(
-                scene, here._replace(weights=weights, correlation_time=memory), options=self.options
-            )
+            return of(scene, here._replace(weights=weights, correlation_time=memory), options=self.options)
 
+        groups = zip(self.groups, self.runs, strict=True)
+        return [mapped(one, group, local[np.array(runs)]) for group, runs in groups]
+
+    def _samples(self, z: Point, reference: Reference) -> list:
         with reference.stands_in():
-            return logs + sum(
-                jnp.sum(mapped(one, group, local[np.array(runs)]))
-                for group, runs in zip(self.groups, self.runs, strict=True)
-            )
+            return self._of_runs(self.constrain(z), of_samples)
 
     @property
     def initial(self) -> Point:
@@ -152,7 +158,7 @@ class LogDensity(eqx.Module):
         """Return the scene with the parameters at z."""
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
-    def whitened(self, fit: Fit) -> "LogDensity":
+    def whitened(self, fit: Estimates) -> "LogDensity":
         """Return the density of numbers z that are independent with unit variance, according to a fit of the
         same data. Samplers then need few steps.
 
@@ -192,6 +198,30 @@ class LogDensity(eqx.Module):
         factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
 
+    def to_arviz(self, z: Array | np.ndarray):
+        """Return draws z of a sampler as `arviz.InferenceData`: the unknowns in their units by name, measured
+        values, and the logarithm of the density of each of them, for `arviz.loo`.
+
+        Channels of several runs are named `"run 0: lean"`. Missing samples are omitted. Raises ImportError
+        without ArviZ, and ValueError unless z has the axes chains, draws and unknowns.
+        """
+        arviz, z = needed("arviz", "draws as `arviz.InferenceData`", "interop"), self._checked(z)
+        if z.ndim != 3:
+            raise ValueError(f"the draws have shape {z.shape}, expected (chains, draws, {len(self.labels)})")
+        logs = _logs(self, z.reshape(-1, z.shape[-1]), Reference(self.scene, self.layout.parameters))
+        single, values, densities = sum(map(len, self.runs)) == 1, {}, {}
+        for group, runs, of_group in zip(self.groups, self.runs, logs, strict=True):
+            for k, run in enumerate(runs):
+                for name, weights in group.weights.items():
+                    label, known = name if single else f"run {run}: {name}", np.asarray(weights[k]) > 0
+                    values[label] = np.asarray(group.values[name][k])[known]
+                    densities[label] = np.asarray(of_group[name])[:, k, known].reshape(*z.shape[:2], -1)
+        posterior = {name: np.asarray(x) for name, x in self.named(z).items()}
+        found = arviz.from_dict(posterior=posterior, observed_data=values, log_likelihood=densities)
+        for label, unit in zip(self.labels, self.units, strict=True):
+            found.posterior[label].attrs["units"] = unit
+        return found
+
     def _checked(self, z) -> Array:
         z = jnp.asarray(z, real_type())
         if z.shape[-1:] != (len(self.labels),):
@@ -217,6 +247,9 @@ class LogDensity(eqx.Module):
 
 
 _density = compiled(LogDensity._at)
+_logs = compiled(
+    lambda density, z, reference: jax.vmap(partial(LogDensity._samples, density, reference=reference))(z)
+)
 
 
 @shown_from_users_lines

@@ -4,8 +4,10 @@ import os
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from jaxtyping import Array
 
 from jourdain_jax.identification.data.experiment import Data, Experiment
+from jourdain_jax.identification.inference.log_density import log_density
 from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.report.fit_page import fit_page, interval_widths
 from jourdain_jax.identification.report.fit_text import batch_text, text
@@ -19,6 +21,7 @@ from jourdain_jax.identification.report.resumed_fit import (
     profiles,
     taken_up,
 )
+from jourdain_jax.identification.solve.loss import LEAST_SQUARES
 from jourdain_jax.scene.names import Sentences, as_names
 
 
@@ -114,6 +117,26 @@ class Fit(Estimates):
         page = fit_page(self, fitted, shares, held_out, along, units or {})
         with open(path, "w", encoding="utf-8") as file:
             file.write(page)
+
+    def to_arviz(self, data: Data, z: Array | np.ndarray | None = None):
+        """Return draws of the posterior as `arviz.InferenceData`, with chains, measured values and pointwise
+        log likelihoods (`LogDensity.to_arviz`).
+
+        - `data`: the fitted runs.
+        - `z`: draws of a sampler, shape (chains, draws, unknowns), for `log_density(...).whitened(fit)`;
+          default: four chains of 1000 standard normal draws, which is the approximation of this fit.
+
+        Raises ImportError without ArviZ; ValueError for a batch, a failed fit, a robust loss, and unknowns
+        without a standard error.
+        """
+        self._check_one()
+        asked = self.asked
+        if asked.loss != LEAST_SQUARES:
+            raise ValueError("a robust loss has no density of the noise; fit by least squares")
+        density = log_density(asked.scene, data, asked.free, options=asked.options).whitened(self)
+        if z is None:
+            z = np.random.default_rng(0).normal(size=(4, 1000, len(density.labels)))
+        return density.to_arviz(z)
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
