@@ -190,7 +190,7 @@ OPTIONS |= {
     "calls['simulate'](backend='nativ')": "unknown backend `nativ` ... native",
     "calls['rollout'](backend='nativ')": "unknown backend `nativ` ... native",
     "jax.jit(lambda rtol: calls['simulate'](rtol=rtol).q_end)(1e-8)": (
-        "`rtol` is traced, ... pass a `solver` too"
+        "`rtol` is traced, ... pass a `solver`"
     ),
 }
 

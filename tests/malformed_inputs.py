@@ -632,7 +632,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, events='none')": "`events` is the text 'none', expected True or False",
     "jj.simulate(b, {}, t2=1.0)": ("TypeError", "unexpected keyword argument 't2'"),
     "jj.simulate(b, {}, t1=1.0, inputs=[1.0])": (
-        "`inputs` is a list, expected a dictionary: name -> number, function of time, or `jj.Sampled`"
+        "`inputs` is a list, expected a dictionary of numbers, functions of time, or `jj.Sampled` by name"
     ),
     "jj.simulate(b, {}, t1=1.0, inputs={'pull': 1.0})": "`Bead` has no input `pull`; did you mean `push`?",
     "jj.simulate(b, {}, t1=1.0, inputs={'push': 'hard'})": (

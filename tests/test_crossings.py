@@ -192,7 +192,7 @@ def test_what_is_not_watched_is_said():
     many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
     assert "not monitored: there are 40, more than 32" in str(motion(many))
     hidden = motion(Sliding(law=lambda s, t, x, v: jnp.interp(x, jnp.array([0.6, 0.7, 0.8]), jnp.eye(3)[1])))
-    assert "not monitored: the scene keeps parts as calls" in str(hidden)
+    assert "not monitored: parts of the scene are JAX calls" in str(hidden)
     assert hidden.crossings == -1
     dense = motion(STRIP, backend="dense")
     with pytest.warns(
@@ -201,7 +201,7 @@ def test_what_is_not_watched_is_said():
         by_diffrax = motion(STRIP, solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)
     assert dense.crossings == int(by_diffrax.crossings) == -1
     assert "not monitored: the scene has no scalar program" in str(dense)
-    assert "solvers of diffrax do not" in by_diffrax.unwatched
+    assert "the solver is a diffrax solver" in by_diffrax.unwatched
 
 
 def test_a_motion_that_sticks_names_the_load_that_jumps():

@@ -89,7 +89,7 @@ def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
     )
     assert near.warnings == ()
     (text,) = far.warnings
-    assert text.startswith("times are resolved to 2e-07 s, steps are ")
+    assert text.startswith("times are resolved to 2e-07 s, but steps are ")
 
 
 def test_lanes_far_in_time_are_the_ones_at_zero():

@@ -444,7 +444,7 @@ def test_bad_contacts():
         jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
     with pytest.raises(
         ValueError,
-        match=r"contacts with friction, which cannot run back in time from t0 = 0\.0 to t1 = -1\.0 s",
+        match=r"contacts with friction, which cannot run backward in time from t0 = 0\.0 to t1 = -1\.0 s",
     ):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
     with pytest.raises(

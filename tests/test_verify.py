@@ -193,7 +193,7 @@ WRONG = {  # methods of the sledge, the check that must fail, and what it must n
     "an orientation that is no rotation": (
         {"bodies": stretched},
         "inertia",
-        "body `sledge`: its orientation is no rotation matrix",
+        "body `sledge`: its orientation is not a rotation matrix",
     ),
 }
 

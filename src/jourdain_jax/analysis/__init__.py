@@ -1,7 +1,7 @@
 """Analyses of scenes and states: `report`, `verify`, `energy`, `linearize`, `steady`, `family`, `periodic`.
 
-`motion_derivatives.py` has the derivatives at one instant that linearisation, steady motions and families
-share. Open `report.py` or `linearize.py` first.
+`motion_derivatives.py` computes the derivatives at one instant that linearisation, steady motions and
+families share. Open `report.py` or `linearize.py` first.
 """
 
 from jourdain_jax.analysis.derivative_checks import derivative_exists

@@ -1,5 +1,5 @@
-"""Checks of derivatives of accelerations and constraint forces: existence, forward against reverse mode, and
-central differences.
+"""Check derivatives of accelerations and constraint forces: whether they exist, whether forward and reverse
+mode agree, and whether they agree with central differences.
 """
 
 from collections.abc import Callable
@@ -27,8 +27,8 @@ from jourdain_jax.structure.structure import plain_row_lengths, usual_rows
 
 
 def along(f: Callable, arguments, point, direction, u) -> tuple:
-    """Return, along a direction, the value and derivative of `f(arguments, point)`, its values at -2h, -h, h
-    and 2h, and h. The increment h depends on the speeds `u`.
+    """Return the value and the directional derivative of `f(arguments, point)`, its values at increments -2h,
+    -h, h and 2h along the direction, and h. The increment h depends on the speeds `u`.
     """
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
     ends = [
@@ -56,8 +56,8 @@ def central_difference(along: list, h: float):
 def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
     """Return whether accelerations have a derivative along a change of the parameters and coordinates.
 
-    They have none if the change makes dependent constraints independent: `(1 - A A+) dA (1 - A+ A)` is not
-    zero.
+    They have none if the change makes dependent constraints independent, that is, if
+    `(1 - A A+) dA (1 - A+ A)` is not zero.
 
     **Arguments**
 
@@ -65,7 +65,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
       constant ones); `dq`: the change of the coordinates.
     - `inputs`: values of the scene's inputs (default: zero).
 
-    It needs concrete numbers, so it does not run under jit or vmap.
+    Numbers must be concrete: not under jit or vmap.
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
         raise ValueError(
@@ -97,8 +97,9 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
 def gradient_checks(
     scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: Labels, seed: int
 ) -> list[Check]:
-    """Check derivatives along one random direction, for every reduction. The direction is admissible (`Z`) in
-    the coordinates, arbitrary in the speeds, and relative to the values in the parameters.
+    """Check derivatives along one random direction, for each reduction in `names`. In the coordinates the
+    direction is admissible (in the span of `Z`), in the speeds arbitrary, and in the parameters proportional
+    to their values.
 
     Returns an empty list if no reduction applies.
     """
@@ -140,7 +141,7 @@ def gradient_checks(
 
 
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
-    """Return a random combination of accelerations and constraint forces, by every reduction."""
+    """Return a random linear combination of accelerations and constraint forces, for each reduction."""
     names, weights, t, inputs, fixed, usual = arguments
     parameters, q, u = point
     scene = eqx.combine(parameters, fixed)

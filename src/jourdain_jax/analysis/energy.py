@@ -1,4 +1,4 @@
-"""The energy of a scene, and whether it is conserved.
+"""Compute the energy of a scene, and determine whether it is conserved.
 
 E = T + V,   T = sum m v.v/2 + omega.I omega/2
     dE/dt = power of loads without a potential (`dynamics/power.py`)
@@ -44,7 +44,7 @@ class Energy(eqx.Module):
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Conservation of T + V along every motion of a scene, or the list of causes that change it."""
+    """Whether T + V is conserved along every motion of a scene, and if not, the causes of its change."""
 
     conserved: bool
     changed_by: tuple[str, ...]
@@ -66,8 +66,8 @@ def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
 def energy_balance(scene: Scene) -> EnergyBalance:
     """Report whether T + V is conserved, and the powers that change it, eqs. (71)-(73).
 
-    Eight random admissible states with random inputs are examined. A power counts as zero below 1e-9 of the
-    largest power (1e-4 in single precision). Raises DifferentiationModeError for traced numbers.
+    Eight random admissible states with random inputs are examined. A power counts as zero if it is below 1e-9
+    of the largest power (1e-4 in single precision). Raises DifferentiationModeError for traced numbers.
     """
     t, q, u = (jnp.asarray(x) for x in sample_states(scene, 8))
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))

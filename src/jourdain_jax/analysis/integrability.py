@@ -1,26 +1,26 @@
-"""Holonomic constraints: single constraints by Frobenius' criterion, all together by the growth of the
-admissible velocities.
+"""Determine which constraints are holonomic: each one by Frobenius' criterion, all together by the growth of
+the admissible velocities.
 
 A constraint `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 =
 d - alpha . nu`. It is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the
 velocities that w admits (Frobenius).
 
-All constraints together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1
-= D_k + [D_1, D_k]` grow to a final dimension; the motion stays on a manifold of that dimension. If
+All constraints together: with the admissible velocities `qdot = X y + X_0`, the spaces `D_1 = span X`,
+`D_k+1 = D_k + [D_1, D_k]` grow to a final dimension, and the motion stays on a manifold of that dimension. If
 constraints or rates depend on time or are not homogeneous, time counts as an additional coordinate with the
-field `(1, X_0)`; its dimension is omitted from the growth vector.
+field `(1, X_0)`; the growth vector does not count it.
 
-`[X, Y] = DY X - DX Y` along the fields. Brackets of brackets need derivatives of derivatives, taken by
-central differences of eighth order (to about 1e-11): every further exact derivative would double the cost.
-Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical
-Systems VII (1994).
+The Lie bracket is `[X, Y] = DY X - DX Y`. Brackets of brackets need second and higher derivatives. These are
+taken by central differences of eighth order (to about 1e-11), because each further exact derivative would
+double the cost. Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya.
+Gershkovich, Dynamical Systems VII (1994).
 
-Constraints and coordinate rates are linear functions of the speeds,
+Constraints and coordinate rates are linear in the speeds,
 
-    A u + d = 0,   qdot = N u + nu,          and their derivatives in x = (t, q)
+    A u + d = 0,   qdot = N u + nu.
 
-evaluated at many points on NumPy, from the scene's scalar graph with its sparse derivatives, without
-compilation.
+They and their derivatives with respect to x = (t, q) are evaluated at many points by NumPy, from the scene's
+scalar graph and its sparse derivatives, without compilation.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ Both = tuple[np.ndarray, np.ndarray]
 
 
 class RowsOverStates:
-    """The constraints and rates of a scene as functions of points x = (t, q)."""
+    """Constraints and coordinate rates of a scene as functions of points x = (t, q)."""
 
     def __init__(self, scene: Scene):
         self.scene, self.traced = scene, traced_scene(scene)
@@ -61,8 +61,8 @@ class RowsOverStates:
         ]
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
-        """Return values at the points for the speeds u, and their derivative as a function of directions. The
-        speeds matter only for nonlinear constraints.
+        """Return the rows (d, A) and the frame (1, 0; nu, N) at points, and a function that returns their
+        derivatives along directions. The speeds `u` matter only for nonlinear constraints.
 
         `x`, `u` and the directions have a leading axis of points.
         """
@@ -82,8 +82,8 @@ class RowsOverStates:
         return self._arranged(value, u, 1.0), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
-        """Return the rows and the frame as arrays whose last axis counts the points; `time`: the rate of the
-        time coordinate.
+        """Return the rows and the frame as arrays with a leading axis of points. `time`: the rate of the time
+        coordinate.
         """
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
@@ -96,7 +96,7 @@ class RowsOverStates:
         return np.concatenate([d[..., None], A], axis=-1), F
 
 
-STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
+STEP = {"float64": 0.02, "float32": 0.1}  # of central differences along unit directions
 
 
 def integrable_below() -> float:
@@ -105,11 +105,11 @@ def integrable_below() -> float:
 
 
 def frobenius_violations(scene: Scene) -> dict[str, float]:
-    """Return Frobenius' criterion for every single constraint, at six random admissible states of the domain.
+    """Return the violation of Frobenius' criterion by each constraint, at six random admissible states.
 
-    The criterion is the largest value of the two-form dw on unit velocities that w admits, over all states,
-    divided by the size of w and of its derivatives. It is infinite for constraints nonlinear in the speeds,
-    which are no differential forms.
+    The violation is the largest value of the two-form dw on unit velocities that w admits, over all states,
+    divided by the size of w and of its derivatives. It is infinite for constraints that are nonlinear in the
+    speeds, because these are not differential forms.
     """
     names = structure_of(scene).row_names
     if not names:
@@ -129,10 +129,10 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
 
 
 def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.ndarray) -> float:
-    """Return the largest value of dw on unit velocities that w admits, w F = a, divided by the size of w. The
-    last axis of `da` and `dF` are directions in (t, q).
+    """Return the largest value of dw on unit velocities that w admits, divided by the size of w and of its
+    derivatives. The form w is given by w F = a; the last axis of `da` and `dF` counts directions in (t, q).
 
-    dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x) of fields X = F x, Y = F y with constant x and y
+    dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x) for fields X = F x, Y = F y with constant x and y
     """
     U, S, Vt = np.linalg.svd(F, full_matrices=False)
     kept = 1e-12 * S[0] < S
@@ -149,11 +149,11 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
 
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
     """Return the growth vector of the admissible velocities at generic states, and whether it is closed.
-    Brackets have at most `depth` fields. The vector is closed if longer brackets add nothing or all
-    dimensions are reached, and empty for constraints nonlinear in the speeds.
 
-    The larger of the results at two random states counts. A bracket is a new direction if its new part
-    exceeds 1e-6 (1e-2 in single precision) of its terms.
+    Brackets have at most `depth` fields. The vector is closed if longer brackets add no direction or all
+    dimensions are reached. It is empty if constraints are nonlinear in the speeds. Of the results at two
+    random states, the larger is returned. A bracket adds a direction if its component outside the span of the
+    others exceeds 1e-6 (1e-2 in single precision) of its terms.
     """
     structure = structure_of(scene)
     if not structure.affine:
@@ -164,7 +164,7 @@ def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def reachable(scene: Scene) -> int:
-    """Return the number of coordinates minus the number of unit norms, which always hold."""
+    """Return the number of coordinates minus the number of quaternion norms, which are always constant."""
     return len(scene.coordinate_names) - len(scene.coordinates.quaternions)
 
 
@@ -176,7 +176,7 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
     if not len(generators):
         return (0,), True
     spanned = np.zeros((0, len(x)))
-    newest = generators[:, None]  # brackets: number, fields in each, coefficients of the generators
+    newest = generators[:, None]  # (brackets, fields in each, coefficients of the generators)
     dimensions: list[int] = []
     size = 0.0
     for length in range(1, depth + 1):
@@ -195,8 +195,8 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
-    """Return an orthonormal basis extended by the independent vectors among the values, largest first, and
-    the indices of these vectors.
+    """Extend an orthonormal basis by the independent vectors among `values`, largest first. Return the basis
+    and the indices of these vectors.
     """
     chosen: list[int] = []
     while len(chosen) < len(values):
@@ -214,10 +214,10 @@ def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple
 def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return brackets `[X, [Y, ...]]` at points x, and the sizes of their terms.
 
-    `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of
-    X, Y, ...
+    `x` has shape (brackets, coordinates). `parts` has shape (brackets, fields in each, generators) and
+    contains the coefficients of X, Y, ... in the generators.
     """
-    together = 256  # points
+    together = 256  # points evaluated in one call
     pieces = [(x[i : i + together], parts[i : i + together]) for i in range(0, len(x), together)]
     values, sizes = zip(*(_brackets_of(fields, some, *fields(some), of) for some, of in pieces), strict=True)
     return np.concatenate(values), np.concatenate(sizes)
@@ -226,8 +226,8 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 def _brackets_of(
     fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the result of `_brackets`, from the generators at these points and their derivatives `along`
-    directions.
+    """Compute `_brackets` from the generators at these points (`here`) and a function for their derivatives
+    `along` directions.
     """
     first = np.einsum("bng,bg->bn", here, parts[:, 0])
     if parts.shape[1] == 1:
@@ -255,8 +255,8 @@ def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> 
 
 
 class _Fields:
-    """The generators `X` as columns over q, and their derivatives. Generators that depend on time are columns
-    over (t, q), with `(1, X_0)` first.
+    """Generators X of the admissible velocities, as columns of rates of q, and their derivatives. If they
+    depend on time, they are columns of rates of (t, q), and `(1, X_0)` is the first.
     """
 
     def __init__(self, scene: Scene, with_time: bool, u):
@@ -275,7 +275,7 @@ class _Fields:
         (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
         length = np.linalg.norm(a[..., 1:], axis=2, keepdims=True)
         scale = 1 / np.where(length > 0, length, 1.0)
-        # X = F C,  a C = 0,  a dC = -da C, in the dependent speeds only
+        # X = F C,  a C = 0,  a dC = -da C, solved for the dependent speeds
         C = np.zeros((len(x), a.shape[2], len(self.free)))
         C[:, self.free, np.arange(len(self.free))] = 1.0
         C[:, self.dependent] = self._solved(scale * a, scale * a @ C)

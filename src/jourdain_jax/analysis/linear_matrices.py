@@ -1,4 +1,6 @@
-"""Matrices of small motions: A, B of the first form and M, C, K, F of the second (`linearize.py`)."""
+"""Compute the matrices of small motions: A, B of the first-order form; M, C, K, F of the second-order form
+(`linearize.py`).
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,13 +20,13 @@ from jourdain_jax.scene.scene import Scene
 
 
 def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coordinates: Labels) -> dict:
-    """Return the contents of `Linearization`."""
+    """Return the matrices and scalars of a `Linearization`, by field name."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
     (S, turned), constant = perturbations(scene), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
-    # derivatives along every perturbation (ds, du, df), and perturbations as functions of the independent
+    # derivatives along all perturbations (ds, du, df); T: all perturbations as functions of the independent
     # ones
     along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
     T = eliminated(
@@ -36,9 +38,9 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
         smallest_pivot(along[at.phi], count + others(chosen, m)),
     )
 
-    # rows of A and B: rates of the independent ds in axes that rotate with the unperturbed motion, and of the
-    # privileged speeds; a rotation ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq =
-    # (B q0dot) ds
+    # rows of A and B: rates of the independent ds, in axes that rotate with the unperturbed motion, and of
+    # the privileged speeds. A rotation ds after q has the rate d(q0' q)/dt = q0' (qdot - q0dot q0' q), with
+    # q0dot q0' dq = (B q0dot) ds
     rates = (S + 4 * turned @ q).T[kept] @ (along[at.qdot] @ T - turned @ v[at.qdot] @ T[:count])
     rates = xp.concatenate([rates, along[constant] @ T])
     n = len(kept) + len(y)
@@ -52,8 +54,8 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
 
 
 def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates: Labels):
-    """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass`: for the privileged
-    speeds.
+    """Return M, C, K, F of the named coordinates, and their coupling to other coordinates. `mass`: mass
+    matrix of the privileged speeds.
     """
     count, k, xp = len(independent), len(coordinates), array_module(A)
     p = np.array([independent.index(name) for name in coordinates], int)
@@ -74,8 +76,8 @@ def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates:
 
 
 def _relative(neglected, kept):
-    """Return the ratio of the largest neglected entry to the largest kept one, or the entry itself if all
-    kept ones are zero.
+    """Return the ratio of the largest neglected entry to the largest kept entry. If all kept entries are
+    zero, return the largest neglected entry.
     """
     xp = array_module(kept)
     size = largest(kept)
@@ -83,8 +85,8 @@ def _relative(neglected, kept):
 
 
 def own_rate(scene: Scene, name: str) -> int | None:
-    """Return the index of the speed that is the rate of the perturbation `name`; None for a scene with
-    user-defined speeds.
+    """Return the index of the speed that is the rate of the perturbation `name`; None if the scene defines
+    its own speeds.
     """
     if scene.speeds is not None:
         return None
@@ -95,7 +97,7 @@ def own_rate(scene: Scene, name: str) -> int | None:
 def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
     """Return the positions in y of the privileged speeds other than the rates of the named coordinates."""
     if len(coordinates) == len(y):
-        return np.zeros(0, int)  # as many as there are freedoms: their rates replace all of y
+        return np.zeros(0, int)  # one per degree of freedom: their rates replace all of y
     own = [own_rate(scene, name) for name in coordinates]
     beside = [j for j, speed in enumerate(y) if speed not in own]
     if len(beside) + len(coordinates) == len(y):

@@ -1,13 +1,13 @@
-"""Small motions about a steady motion, on the constraint manifold.
+"""Linearise the equations of motion about a steady motion, on the constraint manifold.
 
     x = (independent coordinates, privileged speeds):              dx/dt = A x + B f
     named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f
                                                                    M = W' (mass matrix) W
 
-Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second form is
-Appell's equations for the named coordinates: the first form in the speeds (pdot, other privileged speeds),
-times M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody
-System Dynamics 33 (2015) 143.
+Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second-order form
+is Appell's equations for the named coordinates: the first-order form, written with the speeds (pdot, other
+privileged speeds) and multiplied by M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson,
+G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
 import equinox as eqx
@@ -62,7 +62,11 @@ class Modes(eqx.Module):
 
 
 class Linearization(Printed, eqx.Module):
-    """Equations of small motions about a state; the module's docstring has the formulas."""
+    """Linear equations of small motions about a state.
+
+    x = (independent coordinates, privileged speeds): dx/dt = A x + B f. For the named coordinates p:
+    M pddot + C pdot + K p = F f.
+    """
 
     A: Float[Array, "states states"]
     B: Float[Array, "states inputs"]
@@ -70,12 +74,12 @@ class Linearization(Printed, eqx.Module):
     C: Float[Array, "parts parts"]
     K: Float[Array, "parts parts"]
     F: Float[Array, "parts inputs"]
-    acceleration: Scalar  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
-    residual: Scalar  # larger of `acceleration` and |d2y/dt2| along the motion: zero if it is steady
-    # largest coefficient of other coordinates in the second form, relative to those in M, C, K
+    acceleration: Scalar  # largest |dy/dt| of the privileged speeds y at the state; zero if it is steady
+    residual: Scalar  # larger of `acceleration` and |d2y/dt2| along the motion; zero if it is steady
+    # largest coefficient of other coordinates in the second-order form, relative to those in M, C, K
     coupling: Scalar
-    # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent speeds or
-    # coordinates
+    # smallest singular value of the scaled constraint rows of the dependent variables; near zero: choose
+    # other dependent speeds or coordinates
     pivot: Scalar
     # of coordinates, speeds and inputs, along the independent ones: states, then inputs
     followed: Float[Array, "all independent"]
@@ -109,8 +113,8 @@ class Linearization(Printed, eqx.Module):
 
     @property
     def code(self) -> Count:
-        """Return 0, or `SINGULAR_PARTITION` if the privileged speeds and coordinates do not determine the
-        others; then all results are NaN.
+        """Return 0, or `SINGULAR_PARTITION` if the independent speeds and coordinates do not determine the
+        others. In that case all results are NaN.
         """
         return jnp.where(self.pivot >= SMALLEST_PIVOT, result_codes.SUCCESS, result_codes.SINGULAR_PARTITION)
 
@@ -121,24 +125,24 @@ class Linearization(Printed, eqx.Module):
         return _roots(self._companion())
 
     def modes(self, names: Labels | None = None) -> Modes:
-        """Return the values of `eigenvalues` with the shapes of their modes in the named coordinates, without
-        derivatives.
+        """Return the modes of the second-order form: `eigenvalues`, and mode shapes in the named coordinates.
+        They have no derivatives.
 
-        `names`: names of the modes, in this order; default: the `mode_names` of the scene, or "mode 1", ...
+        `names`: names of the modes, in the order of the eigenvalues; default: the `mode_names` of the scene,
+        or "mode 1", ...
         """
         values, shapes, left, condition = _decomposed(self)
         return Modes(values, shapes, left, condition, self.about[0], names)
 
     def sensitivities(self, mode: str, held: str | Labels = (), names: Labels | None = None) -> Sensitivities:
-        """Return derivatives of a mode's eigenvalue with respect to every parameter:
-        `small.sensitivities("weave")["c"]`. Of a pair, the eigenvalue above the real axis is taken. Machine
-        code computes the derivatives.
+        """Return derivatives of a mode's eigenvalue with respect to all parameters, as in
+        `small.sensitivities("weave")["c"]`. Of a conjugate pair, the eigenvalue above the real axis is taken.
 
-        They include the change of the steady motion. `held`: names of coordinates and speeds that keep their
-        values, as many as neighbouring steady motions have freedoms; default: speeds in the scene's order,
-        for a bicycle `x_rate`. `names`: as in `modes`. At a double root all derivatives are NaN, and `code`
-        is not 0. Raises ValueError for an unknown mode and a motion that is not steady; `NotLowered` if the
-        scene has no scalar program.
+        The derivatives include the change of the steady motion. `held`: names of the coordinates and speeds
+        that keep their values and so select a steady motion among its neighbours; default: speeds in the
+        scene's order, for a bicycle `x_rate`. `names`: as in `modes`. At a double root all derivatives are
+        NaN, and `code` is not 0. Raises ValueError for an unknown mode and a motion that is not steady,
+        `NotLowered` if the scene has no scalar program.
         """
         found = self.modes(names)
         check_name(mode, dict.fromkeys(found.names), f"no mode `{mode}`")
@@ -150,9 +154,9 @@ class Linearization(Printed, eqx.Module):
     def state_eigenvalues(self) -> Complex[Array, "states"]:
         """Return eigenvalues of A, 1/s, by ascending real part.
 
-        Ignorable coordinates, and speeds that a steady motion can have at any value, give zero eigenvalues.
-        They often form Jordan blocks, whose eigenvalues are sensitive to round-off: an error of 1e-16 may
-        appear as 1e-8. `eigenvalues` omits them.
+        Ignorable coordinates, and speeds of which a steady motion may have any value, give zero eigenvalues.
+        These often form Jordan blocks and are then sensitive to round-off: an error of 1e-16 may change a
+        zero eigenvalue to 1e-8. `eigenvalues` omits them.
         """
         return _roots(self.A)
 
@@ -219,8 +223,8 @@ def linearize(
     dependent: str | Labels | None = None,
     privileged: str | Labels | None = None,
 ) -> Linearization:
-    """Return the equations of motion linearised about a steady `state`, with a residual that measures its
-    steadiness.
+    """Return the equations of motion linearised about a steady `state`, and a residual that shows how steady
+    it is.
 
         bicycle = WhippleBicycle()
         small = linearize(bicycle, start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
@@ -228,27 +232,26 @@ def linearize(
 
     **Arguments**
 
-    - `state`: on the constraints. If it is not steady, A, B and M, C, K hold only at this instant, and
-      `residual` measures the deviation. They are constant along a steady motion in which only ignorable
-      coordinates move, such as a disc's yaw and spin.
-    - `coordinates`: names for the second-order form; default: all coordinates with a privileged rate. A
-      quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body axes.
+    - `state`: a state on the constraints. If only ignorable coordinates move, such as the yaw and the spin of
+      a disc, the motion is steady and the matrices are constant along it. Otherwise they hold only at this
+      instant, and `residual` measures the deviation.
+    - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is privileged.
+      A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body axes.
     - `inputs`: values of the scene's inputs (default: zero), held constant.
-    - `dependent`: names of the coordinates determined by the geometric constraints; `privileged`: names of
-      the independent speeds. The default is well conditioned at the state (for a traced state or traced
+    - `dependent`: names of the coordinates that the geometric constraints determine; `privileged`: names of
+      the independent speeds. Defaults are well conditioned at the state (for a traced state or traced
       parameters, over the scene's domain).
 
-    Nothing is integrated or searched for, so no field of `jj.Options` applies; `jj.build` chooses the
-    backend.
+    No option of `jj.Options` applies, because nothing is integrated. `jj.build` chooses the backend.
 
-    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and
-    the state. If the privileged speeds do not determine the others, all results are NaN and `code` is not 0:
-    name others.
+    **Returns** a `Linearization`. The function is pure and runs under jit, vmap and differentiation with
+    respect to parameters and state. If the privileged speeds do not determine the others, all results are NaN
+    and `code` is not 0: name others.
 
-    **Raises** ValueError for an unknown coordinate or speed; a coordinate that is both named and dependent,
-    or whose rate is no privileged speed; and, at a known state, speeds or coordinates that do not determine
-    the others. **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction
-    does at rest.
+    **Raises** ValueError for an unknown coordinate or speed; for a named coordinate that is dependent or
+    whose rate is not privileged; and, at a known state, if the independent speeds or coordinates do not
+    determine the others. **Warns** (`SensitivityWarning`) if a load has a kink or jumps at the state, as dry
+    friction does at rest.
     """
     built, scene = scene, as_rolling(scene, "linearize")
     f = as_input_vector(scene, inputs)
@@ -278,12 +281,12 @@ def linearize(
 
 
 def _warn_of_loads(scene: Scene, state: State, f) -> None:
-    """Issue a warning if loads have no derivative; traced values are not checked."""
+    """Warn if a load has no derivative at the state. Traced values are not checked."""
     if not is_traced((scene, state, f)) and (rough := bent_load(scene, state.t, state.q, state.u, f)):
         text = (
-            f"the linearization of `{type(scene).__name__}` ignores that {rough} has no derivative at this "
-            "state: it has a kink or jumps there, as dry friction does at rest. Linearize at a state nearby, "
-            "or make the load smooth, as by `jnp.tanh`"
+            f"the linearization of `{type(scene).__name__}` is not valid: {rough} has no derivative at this "
+            "state, because it has a kink or jumps there, as dry friction does at rest. Linearize at another "
+            "state, or smooth the load, as with `jnp.tanh`"
         )
         warn(text, SensitivityWarning)
 
@@ -311,7 +314,7 @@ def _about(
 
 @compiled_quickly
 def _decomposed(found: Linearization) -> tuple[Array, Array, Array, Array]:
-    """Return the contents of `Modes` for the second-order form."""
+    """Return eigenvalues, mode shapes, left shapes and condition of the second-order form, as in `Modes`."""
     values, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(found._companion()))
     order, k = jnp.lexsort((values.imag, values.real)), len(found.coordinates)
     values, left, right = values[order], left[:, order], right[:, order]

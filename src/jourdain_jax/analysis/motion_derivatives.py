@@ -1,10 +1,11 @@
-"""A motion at one instant with its derivatives, for linearisation, steady motions and families.
+"""Compute rates and constraints at one instant and their derivatives, for linearisation, steady motions and
+families.
 
     v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: closures;  p: varying parameters
 
-The scalar program of a class of scenes gives du/dt of its independent speeds and of requested ones; others
-are zero. It depends only on t, q and the independent speeds: a dependent speed enters only phi. Scenes
-without such a program use dense matrices.
+The scalar program of a class of scenes gives du/dt of its independent speeds and of requested dependent
+speeds; for other speeds du/dt is set to zero. Rates depend only on t, q and the independent speeds; dependent
+speeds enter only phi. Scenes without such a program use dense matrices.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -46,7 +47,7 @@ Nodes = Int[np.ndarray, "_ _"]
 
 
 class Places(NamedTuple):
-    """Positions of the parts of v and of the columns of D. In g, geometric constraints come first."""
+    """Indices of the parts of v and of the columns of D. In g, geometric constraints precede unit norms."""
 
     qdot: np.ndarray
     udot: np.ndarray
@@ -60,7 +61,7 @@ class Places(NamedTuple):
 
 
 def places_of(scene: Scene) -> Places:
-    """Return the positions for a scene."""
+    """Return the indices for a scene."""
     n = len(scene.coordinate_names.entries)
     m = len(scene.speed_names.entries)
     geometric = len(names_of_position_rows(scene))
@@ -73,8 +74,8 @@ def _ranges(*counts: int) -> list[np.ndarray]:
 
 
 class Sloped:
-    """Values of nodes v, their Jacobian D and optionally another matrix, as a function of numbers that may be
-    traced. Runs as machine code or on NumPy.
+    """Function of a vector of numbers that returns the nodes v, their Jacobian D and optionally a matrix of
+    other nodes. Concrete numbers are evaluated by machine code or NumPy, traced ones by machine code or XLA.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Sloped:
         return differentiable(*self._parts)
 
     def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
-        """Return v, D and the other matrix; NaN if a guard is not positive."""
+        """Return v, D and the matrix; NaN if a guard is not positive."""
         xp = array_module(numbers)
         found = (self._traced if xp is jnp else self._known)(numbers)
         *values, guards = (found[which] for which in self._which)
@@ -110,8 +111,8 @@ class Sloped:
 
 
 class ByProgram:
-    """v, D and the mass matrix (unless it is too large) of a class of scenes, as one scalar program. Its
-    input is one vector of all numbers: parameters, t, q, u, inputs.
+    """Scalar program for v, D and the mass matrix (unless it is too large) of a class of scenes. Its argument
+    is a vector of all numbers: parameters, t, q, u, inputs.
     """
 
     def __init__(self, scene: Scene, program: Lowered, asked: Indices, varied: Indices = ()) -> None:
@@ -163,8 +164,8 @@ def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
 
 @dataclass(frozen=True)
 class ByMatrices:
-    """v, D and the mass matrix from a scene's dense matrices, differentiated by JAX, with accelerations of
-    the speeds `constant`.
+    """Function for v, D and the mass matrix from dense matrices, differentiated by JAX. `constant`: indices
+    of the speeds taken as independent, whose accelerations v contains.
     """
 
     constant: Indices
@@ -196,8 +197,8 @@ def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":
-    """Return the program that evaluates a scene at single instants. `constant`: indices of its constant or
-    independent speeds. `masses`: whether their mass matrix is needed.
+    """Return the function that evaluates v and D of a scene at an instant. `constant`: indices of the speeds
+    whose accelerations are needed; `masses`: whether the mass matrix is needed.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
@@ -212,14 +213,16 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Return names of coordinates without effect on accelerations; for a quaternion, names of its parts."""
+    """Return the names of ignorable coordinates, which do not affect accelerations; for a quaternion, the
+    names of its components.
+    """
     return entries_of(
         scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
     )
 
 
 def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
-    """Return names of coordinates; for a quaternion or an angular velocity, names of its parts."""
+    """Return the names, with each quaternion or angular velocity replaced by its components."""
     groups = {
         group: scene.coordinate_names.entries[first : first + length]
         for group, first, length in scene.coordinate_names.groups
@@ -227,12 +230,12 @@ def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
     return {entry for name in names for entry in groups.get(name, (name,))}
 
 
-by_program = once_per_class(ByProgram)  # of a class of scenes; raises `NotLowered` if there is none
+by_program = once_per_class(ByProgram)  # raises `NotLowered` if there is no scalar program
 
 
 def on_rows(scene: Scene) -> np.ndarray:
-    """Return the coordinates on which geometric constraints and unit norms depend at some probed state.
-    Coordinates that cancel there are omitted, even if they occur in the graph.
+    """Return a mask of the coordinates on which geometric constraints and unit norms depend at some probed
+    state. A coordinate that occurs in the graph but cancels is not among them.
     """
     return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
@@ -240,8 +243,8 @@ def on_rows(scene: Scene) -> np.ndarray:
 def _copied(
     graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]
 ) -> list[list[int]]:
-    """Return copies of lists of nodes of another graph, in which its parameters (by leaf), t, q, u and inputs
-    are replaced.
+    """Copy lists of nodes from another graph. `given` replaces the variables: parameters (by leaf), t, q, u
+    and inputs.
     """
     parameters, *rest = variables
     places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]
@@ -254,9 +257,7 @@ def _copied(
 def _evaluated(
     graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy, one
-    operation at a time.
-    """
+    """Return a function from variables to values of nodes, by machine code if possible, else by NumPy."""
     if jax.config.jax_enable_x64 and is_made(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
         return lambda given: np.asarray(kernel(given))
@@ -266,8 +267,8 @@ def _evaluated(
 
 
 def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Return values of nodes as a function that JAX differentiates: by machine code if possible, otherwise by
-    XLA.
+    """Return a function from variables to values of nodes that JAX can differentiate, by machine code if
+    possible, otherwise by XLA.
     """
     if is_made(graph, nodes):
         return values_of_nodes(graph, nodes, variables)

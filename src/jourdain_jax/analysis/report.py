@@ -1,5 +1,5 @@
-"""A report on the kind of system: freedoms, constraints, rank, integrability, growth, cyclic and ignorable
-coordinates.
+"""Report what kind of system a scene is: degrees of freedom, constraints, rank, integrability, growth vector,
+cyclic and ignorable coordinates.
 """
 
 import textwrap
@@ -42,14 +42,14 @@ AS_IN_STRUCTURE = (
 
 @dataclass(frozen=True, repr=False)
 class Report(Printed):
-    """Facts about a scene, found at random and symmetric states of its domain; `print(report)` shows a table.
+    """Facts about a scene, found at random and symmetric states of its domain. `print(report)` shows a table.
 
-    Integrability of constraints, singly and together: eqs. (5)-(9) and Frobenius' theorem. Privileged
-    velocities: (25)-(31). Cyclic coordinates: (42).
+    Integrability of constraints, each and together: eqs. (5)-(9) and Frobenius' theorem. Privileged (that is,
+    independent) velocities: (25)-(31). Cyclic coordinates: (42).
 
-    The rate of a cyclic coordinate is not privileged, and no equation depends on the coordinate. No
-    acceleration depends on an ignorable coordinate; without constraints, every coordinate that is absent from
-    the Lagrangian is ignorable.
+    A coordinate is cyclic if its rate is not privileged and no equation depends on it. A coordinate is
+    ignorable if no acceleration depends on it; without constraints, every coordinate that is absent from the
+    Lagrangian is ignorable.
     """
 
     scene: str
@@ -58,7 +58,7 @@ class Report(Printed):
     degrees_of_freedom: int
     rows: Labels
     rank: int  # of the constraints at generic states
-    # constraints that may be omitted together without loss of rank at any probed state
+    # constraints that may be omitted together without reducing the rank at any probed state
     redundant_rows: Labels
     integrable_rows: Labels  # each holonomic by itself
     nonholonomic_rows: Labels  # each nonholonomic by itself
@@ -66,7 +66,7 @@ class Report(Printed):
     growth_vector: tuple[int, ...]  # empty for constraints nonlinear in the speeds
     closed: bool  # whether further brackets add nothing
     bracket_depth: int
-    holonomic_rows_together: int | None  # None where the growth vector is not closed
+    holonomic_rows_together: int | None  # None if the growth vector is not closed
     rheonomic: bool  # whether anything depends explicitly on time
     depends_on_time: Labels  # which of: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # whether constraints are linear or affine in the speeds
@@ -87,7 +87,7 @@ class Report(Printed):
     conventions: str
 
     def as_dict(self) -> dict:
-        """Return the fields by name, as plain data; None replaces values that are not finite."""
+        """Return the fields by name, as plain data. None replaces infinite values."""
         facts = {
             key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()
         }
@@ -150,8 +150,8 @@ class Report(Printed):
         freedoms = len(self.speeds) - (self.rank_at_start or 0)
         return (
             f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} "
-            "freedoms: a singular configuration, or another way to assemble the scene; a `domain` "
-            "around the start shows which"
+            "freedoms: a singular configuration, or another way to assemble the scene; declare a `domain` "
+            "around the start to find out"
         )
 
     def _growth(self) -> str:
@@ -193,16 +193,17 @@ class Report(Printed):
 def report(
     scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | None" = None
 ) -> Report:
-    """Report freedoms, constraints, rank, redundancy, integrability, growth vector, cyclic and ignorable
-    coordinates of a scene.
+    """Report degrees of freedom, constraints, rank, redundancy, integrability, growth vector, cyclic and
+    ignorable coordinates of a scene.
 
-    `depth` is the largest number of fields in a bracket of the growth vector. `start`: a state, or named
-    values as for `jj.start`, at which the rank is compared with generic states (default: the scene's example,
-    if some configurations lose rank). `print(report(scene))` shows a table; `as_dict()` returns plain data.
+    `depth`: largest number of vector fields in a Lie bracket of the growth vector. `start`: a state, or named
+    values as for `jj.start`, whose rank is compared with that of generic states (default: the scene's
+    example, if some configurations lose rank). `print(report(scene))` shows a table; `as_dict()` returns
+    plain data.
 
     All properties are found numerically, at random states of the scene's `domain` and at symmetric
-    configurations (zero and right angles); a property of all of them counts as general. Raises
-    DifferentiationModeError for traced numbers.
+    configurations (zero and right angles). A property that holds at all of them is reported as general.
+    Raises DifferentiationModeError for traced numbers.
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)
@@ -226,7 +227,7 @@ def report(
         growth_vector=growth,
         closed=closed,
         bracket_depth=depth,
-        # relations that are built into the coordinate rates are not constraints
+        # dependencies built into the coordinate rates are not constraints
         holonomic_rows_together=min(reachable(scene) - growth[-1], structure.rank) if closed else None,
         depends_on_time=structure.timed,
         cyclic_coordinates=cyclic_coordinates(scene),

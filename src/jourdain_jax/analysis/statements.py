@@ -1,10 +1,10 @@
-"""Checks of each statement of a scene (bodies, loads, potentials, constraints), which name a wrong one.
+"""Check each body, load, potential and constraint that a scene defines. A failed check names the wrong one.
 
 inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
                e.e = 1                                                per gravity
 potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i with a potential V_i
-derivatives    d/ds of every statement along one direction in (parameters, t, q, u): autodiff against
-               central differences; no kink
+derivatives    d/ds of each quantity along one direction in (parameters, t, q, u): autodiff agrees with
+               central differences, and there is no kink
 """
 
 import equinox as eqx
@@ -36,7 +36,7 @@ from jourdain_jax.scene.user_methods import loads_of, potential_of
 def statement_checks(
     scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int
 ) -> list[Check]:
-    """Return the checks of inertia, potentials and derivatives; `Z` spans the admissible speeds."""
+    """Return the checks of inertia, potentials and derivatives. `Z` spans the admissible speeds."""
     inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
         check("inertia", inertia, q.dtype),
@@ -70,7 +70,7 @@ def _inertia(motion: Motion) -> dict[str, Scalar]:
         values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = (
             excess / size
         )
-        values[f"body `{name}`: its orientation is no rotation matrix"] = largest(
+        values[f"body `{name}`: its orientation is not a rotation matrix"] = largest(
             body.orientation.T @ body.orientation - jnp.eye(3)
         )
     return values
@@ -83,7 +83,7 @@ def _gravity(scene: Scene, motion: Motion) -> dict[str, Scalar]:
         if isinstance(load, Gravity)
     }
     return {
-        f"{name}: its direction is no unit vector": jnp.abs(jnp.linalg.norm(e) - 1)
+        f"{name}: its direction is not a unit vector": jnp.abs(jnp.linalg.norm(e) - 1)
         for name, e in directions.items()
     }
 
@@ -124,7 +124,8 @@ def _name(i: int, load: Load) -> str:
 
 def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
     """Return all quantities that the scene defines at (t, q, u), by subject."""
-    # poses directly: in a motion they are already differentiated once, which may bypass a custom rule
+    # `pose_at`, because poses in a motion are differentiated already, which may bypass a custom derivative
+    # rule
     motion, pose = motion_at(scene, t, q, u, inputs), pose_at(scene, t, q)
     pieces = {"the coordinate rates": coordinate_rates(scene, t, q, u)}
     for name, placed in pose.bodies.items():
@@ -151,7 +152,7 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
 
 def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     generator = np.random.default_rng(seed)
-    # SI units; below this size, differences are dominated by round-off
+    # in SI units; for smaller quantities, round-off dominates the differences
     floor = 1e-2 if q.dtype == jnp.float32 else 1e-4
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
     draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)
@@ -168,11 +169,12 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
         f = np.asarray(value[name])
         slope = np.asarray(change[name])
         ends = [np.asarray(x[name]) for x in around]
-        # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order if f is smooth, the jump of the
-        # slope at a kink
+        # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order if f is smooth; at a kink, the
+        # jump of the slope
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = largest(f) + largest(slope) + floor
-        # the jump at a kink is of order one, and its estimate has lower order than the difference
+        # weight 1e-3: the jump at a kink is of order one, and its estimate is less accurate than the
+        # difference
         error = np.maximum(np.abs(slope - central_difference(ends, h)), 1e-3 * np.abs(kink))
         values[f"{name}: its derivative"] = np.max(error, initial=0.0) / size
     return check("derivatives", values, q.dtype)

@@ -1,12 +1,11 @@
-"""Steady motions by root finding: privileged speeds are constant, and only coordinates without influence on
-them change.
+"""Find steady motions: privileged speeds are constant, and only ignorable coordinates change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0
 
 y: the privileged speeds; j: the coordinates that are not ignorable. Families of steady motions use the same
-equations (`motion_derivatives.py`). They are solved by Levenberg-Marquardt from the guess
-(`calculus/roots.py`). Steadiness of the result is judged by dy/dt and d2y/dt2 along the motion, without the
-list of ignorable coordinates.
+equations (`motion_derivatives.py`). The Levenberg-Marquardt method solves them from the guess
+(`calculus/roots.py`). The residual of the result contains dy/dt and d2y/dt2 along the motion, and so does not
+rely on the list of ignorable coordinates.
 """
 
 from collections.abc import Mapping
@@ -62,7 +61,7 @@ _REFUSED = dict.fromkeys(
 
 
 class SteadyMotion(Printed, eqx.Module):
-    """A state of steady motion, and the residual of its steadiness."""
+    """State of a steady motion, and a residual that shows how steady it is."""
 
     state: State
     acceleration: Scalar  # largest remaining |dy/dt|
@@ -93,30 +92,32 @@ def steady(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> SteadyMotion:
-    """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`. Only coordinates without influence on
-    accelerations move.
+    """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`. Only coordinates that do not affect
+    accelerations change.
 
         guess = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}
         steady(disc, guess, held=("lean", "yaw_rate"))["spin_rate"]
 
     **Arguments**
 
-    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It may violate the constraints.
-    - `held`: names of coordinates and speeds that keep the guess's value; all others are unknown. If many
-      steady motions have these values, the result is one near the guess.
-    - `moving`: names of the coordinates that may change; default: coordinates without influence on the
-      scene's accelerations (`ignorable`).
+    - `guess`: a `State`, or named values (omitted ones are zero) at time `t0` (s). It may violate the
+      constraints.
+    - `held`: names of coordinates and speeds that keep the value of the guess; all others are unknown. If
+      several steady motions have these values, the result is one near the guess.
+    - `moving`: names of the coordinates that may change during the motion; default: those that do not affect
+      accelerations (ignorable coordinates).
     - `inputs`: values of the scene's inputs (default: zero).
-    - `privileged`: names of the speeds that must be constant (default: the scene's own). Choose speeds in
-      which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
-    - `options`: a `jj.Options`, of which only `max_steps` has an effect, the largest number of steps of the
-      search (default: 60); `by_name`: `max_steps`. The search runs to round-off.
+    - `privileged`: names of the speeds that must be constant (default: the scene's own). Choose speeds that
+      are constant in the motion, for example rates of yaw, lean and spin instead of velocities along fixed
+      axes.
+    - `options`: a `jj.Options`. Only its `max_steps` has an effect: the largest number of steps of the search
+      (default: 60). `by_name`: `max_steps`. The search runs to round-off.
 
-    **Returns** a `SteadyMotion`. Inspect `converged` and `residual`: a failed search raises no error. Where
-    the steady motion is a smooth function of the scene's parameters and the held values, it is differentiable
-    in them, in any mode.
+    **Returns** a `SteadyMotion`. Inspect `converged` and `residual`: a failed search raises no error. The
+    result is differentiable, in any mode, wherever it is a smooth function of the scene's parameters and the
+    held values.
 
-    **Raises** ValueError for an unknown name, and TypeError for another option by name.
+    **Raises** ValueError for an unknown name, and TypeError for any other option given by name.
     """
     most_steps = as_options(
         Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED
@@ -133,7 +134,8 @@ def steady(
     moving = ignorable if moving is None else as_names(moving)
     check_names(carried := entries_of(scene, moving), entries, unknown)
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
-    # no equation changes with them: they keep the guess's value, and no step runs away along them
+    # no equation depends on these coordinates: they keep the value of the guess, so that no step diverges
+    # there
     idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
@@ -161,8 +163,8 @@ class _Problem(eqx.Module):
     resting: Indices = static()  # coordinates that must not change
 
     def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, list[Scalar]]:
-        """Return the residual, its derivatives, and the largest magnitudes of the constraints, of dy/dt, and
-        of d2y/dt2.
+        """Return the residual, its Jacobian, and the largest magnitudes of the constraint residuals, of dy/dt
+        and of d2y/dt2.
         """
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, self.t, z[: len(at.q)], z[len(at.q) :], self.f)

@@ -1,10 +1,10 @@
-"""Perturbations of a state on the constraint manifold, and a choice of independent ones.
+"""Perturbations of a state on the constraint manifold, and the choice of independent ones.
 
     dq = E ds,   dg = G ds = 0,   dphi = Phi_s ds + A du + Phi_f df = 0
 
 For a plain coordinate, `ds` equals `dq`. A quaternion is perturbed by a small rotation in body axes, `dq = q
-(0, ds)/2`, so that no component is special. The geometric constraints g determine dependent `ds`, all
-velocity constraints phi dependent `du`.
+(0, ds)/2`, so that no component is special. The geometric constraints g determine the dependent `ds`; the
+velocity constraints phi determine the dependent `du`.
 """
 
 import jax
@@ -25,8 +25,8 @@ from jourdain_jax.structure.structure import WELL_CONDITIONED, structure_of, usu
 
 
 def perturbed_names(scene: Scene) -> Labels:
-    """Return the names of `ds`: plain coordinates, and three rotations in body axes per quaternion:
-    `attitude_turn_x`, `..._y`, `..._z`.
+    """Return the names of the perturbations `ds`: the plain coordinates, and for each quaternion three
+    rotations in body axes, such as `attitude_turn_x`, `..._y`, `..._z`.
     """
     names = list(scene.coordinate_names.entries)
     for first, _ in reversed(scene.coordinates.quaternions):
@@ -63,7 +63,9 @@ _HALF_A_TURN = (
 
 
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
-    """Return the inverse, or the pseudo-inverse of a rectangular matrix; NaN if there is none."""
+    """Return the inverse of a square matrix, or the pseudo-inverse of a rectangular one; NaN if there is
+    none.
+    """
     try:
         return (
             array_module(x).linalg.inv(x)
@@ -82,7 +84,9 @@ def others(some, count: int) -> Int[np.ndarray, "rest"]:
 def eliminated(
     rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]
 ) -> Float[Entries, "all independent"]:
-    """Return the matrix from independent to all perturbations, such that `rows @ perturbation = 0`."""
+    """Return the matrix that maps independent perturbations to all perturbations with `rows @ perturbation =
+    0`.
+    """
     dependent = others(independent, rows.shape[1])
     rows = _of_unit_length(rows, dependent)
     followed = -inverse(rows[:, dependent]) @ rows[:, independent]
@@ -94,8 +98,8 @@ def eliminated(
 def smallest_pivot(
     rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
 ) -> Float[Entries, ""]:
-    """Return the smallest singular value of the dependent columns, with rows of unit length. Its derivative
-    is zero.
+    """Return the smallest singular value of the dependent columns, scaled to rows of unit length. It is
+    treated as constant in differentiation.
     """
     xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
     if xp is np and not all_finite(block):
@@ -107,23 +111,23 @@ def smallest_pivot(
 def _of_unit_length(
     rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
 ) -> Float[Entries, "rows all"]:
-    """Return rows divided by the lengths of their dependent parts."""
+    """Return the rows, each divided by the length of its dependent part."""
     xp, block = array_module(rows), rows[:, dependent]
     length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
     return rows / xp.where(length > 0, length, 1.0)
 
 
 def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> Indices:
-    """Return indices of the independent speeds: the named ones, else the scene's choice, else an automatic
-    choice.
+    """Return the indices of the independent speeds: the named ones if given, otherwise those of the scene's
+    structure.
     """
     known = structure_of(scene)
     return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
 
 
 def privileged_at(scene: Scene, state: State, f, usual: Indices) -> Indices:
-    """Return indices of independent speeds at a known state: the `usual` ones, or others if these determine
-    the rest poorly.
+    """Return the indices of independent speeds at a known state: the `usual` ones, or others if the usual
+    ones do not determine the dependent speeds well.
     """
     A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
     rank = count - len(usual)
@@ -144,10 +148,10 @@ def dependent_coordinates(
     dependent: Labels | None,
     G: Float[np.ndarray, "rows coordinates"] | None = None,
 ) -> Int[np.ndarray, "dependent"]:
-    """Return indices of the dependent perturbations `ds`, which the geometric constraints determine:
-    `dependent` if given, else a well conditioned choice.
+    """Return the indices of the dependent perturbations `ds`, which the geometric constraints determine:
+    those in `dependent` if given, otherwise a well-conditioned choice.
 
-    `G`: dg/dq at the state, if known; otherwise states of the scene's domain are used.
+    `G`: dg/dq at the state. If it is unknown, states of the scene's domain are used instead.
     """
     names = perturbed_names(scene)
     check_names(

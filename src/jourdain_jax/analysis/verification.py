@@ -1,4 +1,4 @@
-"""Results of `verify`: comparisons, each with size, threshold and culprit, and their table."""
+"""Results of `verify`: checks, each with its value, threshold and culprit, and a table of them."""
 
 import equinox as eqx
 import numpy as np
@@ -7,7 +7,7 @@ from jourdain_jax.calculus.reals import static
 from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 
-# relative to the size of the compared quantities, in double and in single precision
+# in double and in single precision, relative to the size of the compared quantities
 THRESHOLDS = {
     "inertia": (1e-10, 1e-5),
     "potentials": (1e-10, 1e-4),
@@ -23,7 +23,7 @@ THRESHOLDS = {
 
 
 class Check(eqx.Module):
-    """One comparison: its relative size, threshold and culprit."""
+    """One check: the relative difference found, its threshold and the culprit."""
 
     name: str = static()
     value: float
@@ -43,8 +43,8 @@ class Check(eqx.Module):
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """Return the check called `name` (a key of `THRESHOLDS`), given one number per suspect. NaN counts as
-    larger than any number.
+    """Return the check `name` (a key of `THRESHOLDS`) from one value per suspect. The suspect with the
+    largest value is the culprit; NaN counts as larger than any number.
     """
     threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
     if not values:
@@ -64,8 +64,8 @@ class Verification(Printed, eqx.Module):
 
     @property
     def certifies(self) -> bool:
-        """Return whether passing means agreement to round-off of double precision. Single precision shows
-        only gross errors.
+        """Return whether passing proves agreement to round-off in double precision. In single precision, only
+        gross errors are detected.
         """
         return all(check.threshold <= THRESHOLDS[check.name][0] for check in self.checks)
 
@@ -75,14 +75,14 @@ class Verification(Printed, eqx.Module):
         return all(check.passed for check in self.checks)
 
     def largest(self, *names: str) -> float:
-        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero
-        without checks.
+        """Return the largest value of the checks `names` (keys of `THRESHOLDS`); NaN if one is NaN, zero if
+        there are none.
         """
         values = [check.value for check in self.checks if check.name in names]
         return float(np.max(values)) if values else 0.0
 
     def as_dict(self) -> dict:
-        """Return the result as plain data: the largest values by kind, and every check."""
+        """Return the result as plain data: the largest value of each kind, and all checks."""
         return {
             "max_disagreement": self.largest("reductions", "forms", "Newton"),
             "virtual_power": self.largest("virtual power"),

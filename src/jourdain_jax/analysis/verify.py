@@ -1,4 +1,4 @@
-"""Verification of a scene's equations at one state: independent formulations must give equal numbers.
+"""Verify a scene's equations at one state: independent formulations must give equal numbers.
 
 inertia            possible masses and inertias; rotation matrices; unit vectors as directions of gravity
 potentials         forces of loads with a potential are minus its gradient
@@ -13,8 +13,8 @@ Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1)
 energy             d(T + V)/dt along the motion, minus the power of loads without potential
 gradients          of udot and A' lambda: forward against reverse mode, and against central differences
 
-`statements.py` has the first three. Everything is computed once and uncompiled, since compilation would take
-several times longer.
+`statements.py` has the first three checks. All checks run once, without compilation, which would take several
+times longer.
 """
 
 from collections.abc import Mapping
@@ -74,13 +74,14 @@ def verify(
     *,
     seed: int = 0,
 ) -> Verification:
-    """Check the equations and statements of a scene at a consistent state; a failed check names its culprit.
+    """Verify the equations of a scene, and each body, load and constraint, at a consistent state. A failed
+    check names its culprit.
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
     Values are relative to the size of the compared quantities. Thresholds depend on the floating-point type
-    (`analysis/verification.py`): single precision shows only gross errors, so passing certifies nothing. If
-    no reduction applies (no inertia along a free direction), there are no gradients to check, and the
+    (`analysis/verification.py`). Single precision detects only gross errors, so passing certifies nothing. If
+    no reduction applies (no inertia along a free direction), gradients cannot be checked, and the
     verification fails.
 
     **Arguments**
@@ -88,10 +89,10 @@ def verify(
     - `state`: a state on the constraints, from `start` or `consistent`, or named values as for `start`.
       Default: the scene's example, otherwise a random state of its domain. Symmetric states may hide errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
-    - `seed`: for the random state and the random directions of derivatives. Directions are admissible in the
-      coordinates, arbitrary in the speeds and relative in the parameters. The Gibbs-Appell reduction is not
-      differentiated. Parameters that would make dependent constraints independent have no derivative and are
-      omitted, with a note (`derivative_exists`).
+    - `seed`: for the random state and the random direction of derivatives. The direction is admissible in the
+      coordinates, arbitrary in the speeds, and proportional to the values of the parameters. The Gibbs-Appell
+      reduction is not differentiated. If a change of the parameters makes dependent constraints independent,
+      no derivative exists (`derivative_exists`): parameters are then omitted, with a note.
 
     **Returns** a `Verification`, printed with the table of `jj.check`. A failed check raises no error. Raises
     DifferentiationModeError for traced numbers.
@@ -146,8 +147,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
         energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot)
     )
     forms = {"Gibbs function": gibbs_equations(scene, t, q, u, inputs)}
-    # a varying mass joins at the body's own velocity (m a = F); d/dt dT/dqdot would count its momentum as
-    # lost
+    # a varying mass joins or leaves at the velocity of its body (m a = F), but d/dt dT/dqdot would count its
+    # momentum as lost
     if speeds_are_rates(scene) and not structure_of(scene).varying_inertia:
         forms["Lagrange's equations"] = lagrange_equations(scene, t, q, u, inputs)
     return {
@@ -174,8 +175,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
 
 
 def _gyroscopic(scene, t, q, u, partial) -> Speeds:
-    """Return the size of the inertia forces `m v omega` and `omega I omega`. They may cancel in `h`, which
-    then has round-off of this size.
+    """Return the size of the inertia forces `m v omega` and `omega I omega`. They may cancel in `h` and then
+    leave round-off relative to this size.
     """
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
@@ -186,7 +187,7 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
 
 
 def _size(found: dict, *others) -> float:
-    """Return the reference size for differences of forces: impressed and inertial forces."""
+    """Return the reference size for differences of forces: that of impressed and inertial forces."""
     forces = (found["impressed"], found["gyroscopic"], *others)
     return sum(largest(force) for force in forces) + tiny_of(found["M"])
 
@@ -225,7 +226,7 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
         return {"the mass matrix and the constraints: no reduction applies": np.inf}
     differences = dict.fromkeys(applicable, 0.0)
     for quantity in ("udot", "force"):
-        # against the median of all, so that one wrong reduction does not make the others look wrong
+        # compare with the median, so that one wrong reduction does not make the others look wrong
         middle = np.median(np.stack([found[quantity][name] for name in applicable]), axis=0)
         size = _size(found, middle)
         differences = {
@@ -236,8 +237,8 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
 
 
 def _acts_on_speeds(scene: Scene) -> bool:
-    """Return whether loads act directly on speeds, or a potential depends on coordinates. In either case the
-    forces on bodies do not include all loads.
+    """Return whether loads act directly on speeds, or the scene has a potential. In either case the forces on
+    bodies do not include all loads.
     """
     flags: list[bool] = []
 

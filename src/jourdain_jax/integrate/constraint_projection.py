@@ -1,8 +1,8 @@
-"""Projection of coordinates or of speeds onto the constraints, by machine code if possible, otherwise by XLA.
-XLA also computes the derivatives.
+"""Project coordinates or speeds onto the constraints, by machine code if possible, otherwise by XLA. XLA also
+computes the derivatives of the projection.
 
-JAX can differentiate constraints and mass matrix that machine code evaluates: the derivative consists of two
-calls of machine code.
+JAX can differentiate constraints and a mass matrix that machine code evaluates. Their derivative consists of
+two calls of machine code.
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
     d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs
@@ -42,7 +42,7 @@ class Usual(eqx.Module):
     """Typical sizes of constraints and coordinates, and properties of the constraints."""
 
     closures: Float[Entries, "closures"]
-    # in scaled speeds, or in plain speeds if constraints determine the free speeds
+    # per unit of scaled speeds, or of plain speeds if constraints determine the free speeds
     rows: Float[Entries, "rows"]
     width: Float[Entries, "coordinates"]  # of the domain
     # bounds of coordinates that constraints determine; infinite if unbounded
@@ -54,8 +54,8 @@ class Usual(eqx.Module):
 
 
 def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
-    """Return the sizes for the parameters of a scene; `determined`: as in `Usual`; `native`: whether
-    machine code may project states.
+    """Return the typical sizes for the parameters of a scene. `determined`: as in `Usual`; `native`: machine
+    code may project states.
     """
     low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
     width = np.where(high > low, high - low, 1.0).astype(real_type())
@@ -71,7 +71,7 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
         affine = structure_whatever_its_faults(scene).affine
         low, high = (x.astype(width.dtype) for x in (low, high))
         return Usual(closure_lengths(scene), rows, width, low, high, affine, determined, program)
-    except ValueError:  # the scene is invalid, which is reported when its structure is requested
+    except ValueError:  # the scene is invalid; `structure_of` reports it
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         no_lengths = np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene)))
         return Usual(*no_lengths, width, -np.inf * width, np.inf * width, False, False, None)
@@ -81,7 +81,7 @@ def put_positions(
     scene: Scene, t, q, free, usual: Usual, known: tuple | None = None
 ) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
     """Return the coordinates nearest to q that satisfy the geometric constraints, and the residual. `known`:
-    both, if already computed.
+    both results if already computed; then only derivatives are added.
     """
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
@@ -116,7 +116,7 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
-    """Return the constraint functions for projection by XLA, derivatives and searches."""
+    """Return the constraint functions that XLA uses for projections, derivatives and searches."""
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
@@ -142,8 +142,8 @@ def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=64)
 def row_functions(program: RowProgram) -> RowFunctions:
-    """Return g and G, phi and A, and M, by the program; parts without machine code
-    use automatic differentiation.
+    """Return functions for (g, G), (phi, A) and M from the program. They use automatic differentiation if
+    machine code cannot evaluate them.
     """
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
     if (

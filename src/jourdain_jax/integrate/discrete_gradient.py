@@ -1,8 +1,8 @@
-"""Energy-preserving integrator: a discrete gradient in the reduced, almost-Poisson
-form of a nonholonomic scene.
+"""Energy-preserving integrator: a discrete gradient in the reduced, almost-Poisson form of a nonholonomic
+scene.
 
-Minimal state z = (q, y), y the independent speeds; H(z) = T + V = y' m(q) y/2 + V(q); qdot = W(q) y. The
-rates are a skew matrix times grad H:
+The state is minimal: z = (q, y) with y the independent speeds; H(z) = T + V = y' m(q) y/2 + V(q);
+qdot = W(q) y. The rates are a skew matrix S times grad H:
 
     qdot =  W m^-1 H_y                                        m = H_yy
     ydot = -m^-1 W' H_q + m^-1 G m^-1 H_y                     G(q, y) skew: G y = r,  r = m ydot + W' H_q
@@ -31,20 +31,21 @@ from jourdain_jax.structure.structure import structure_of
 
 
 class DiscreteGradient(FixedStepMethod):
-    """Energy-preserving discrete-gradient method in reduced form, `simulate(...,
-    solver=DiscreteGradient(step=h))`; h in s.
+    """Energy-preserving discrete-gradient method in reduced form: `simulate(...,
+    solver=DiscreteGradient(step=h))` with h in s.
 
-    With z = (q, y), y the independent speeds, and the rates written as `zdot = S(z) grad H(z)`, S skew and H
-    = T + V: `z_1 - z_0 = h S(z_m) gbar`, z_m = (z_0 + z_1)/2, gbar Gonzalez's discrete gradient of H. It has
-    order 2 and is symmetric in time. T + V is constant to round-off, and velocity constraints hold exactly.
-    Unlike a projection onto the energy after each step, it is symmetric and does not disturb other integrals.
+    Let z = (q, y) with y the independent speeds, and write the rates as `zdot = S(z) grad H(z)` with S skew
+    and H = T + V. A step is `z_1 - z_0 = h S(z_m) gbar`, where z_m = (z_0 + z_1)/2 and gbar is Gonzalez's
+    discrete gradient of H. The method has order 2 and is symmetric in time. T + V is constant to round-off,
+    and velocity constraints hold exactly. Unlike a projection onto constant energy after each step, the
+    method is symmetric and does not disturb other integrals.
 
     It needs a minimal state and a constant T + V: constraints linear and homogeneous in the speeds, loads
     with potentials, no explicit time dependence, and no geometric constraints.
 
-    Use it for long motions of conservative scenes in which a drift of the energy would change the
-    answer. Other integrals are preserved only to the order of the method, and a step costs more
-    than with the other methods.
+    Use it for long motions of conservative scenes in which a drift of the energy would change the result.
+    Other integrals are preserved only to the order of the method, and a step costs more than with other
+    methods.
 
     Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving
     integrators applied to nonholonomic systems, J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O.
@@ -52,8 +53,8 @@ class DiscreteGradient(FixedStepMethod):
     """
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the minimal `field` of the state. Raises ValueError if the `scene` has no constant energy or
-        no minimal state. `asked`: the requested state.
+        """Return `field`. Raises ValueError if the scene has no constant energy, or if the field has no
+        minimal state. `asked`: the requested state.
         """
         fault = _fault(scene, field, asked)
         if fault:
@@ -64,7 +65,7 @@ class DiscreteGradient(FixedStepMethod):
         return field
 
     def solve(self, args: tuple, t, y: Integrated, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s); `args`: as in `integrands.py`."""
+        """Return the change of the state `y` at `t` in a step `h` (s). `args`: as in `integrands.py`."""
         return _solved(args, args[4] + t + h / 2, jnp.asarray(h, y.q.dtype), y)
 
 
@@ -101,7 +102,7 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
     m = jax.jacfwd(H_v)(v)
 
     def r(v):
-        # m ydot + W' H_q, which does not contain the potential
+        # m ydot + W' H_q, in which the potential cancels
         return m @ _rates(args, t, q, v)[1] + W.T @ jax.grad(
             lambda q: _energy(args, t, jnp.concatenate([q, v]), n)
         )(q)
@@ -142,7 +143,7 @@ def _fault(scene: Scene, field: VectorField, asked: str) -> str:
         way_out = (
             ""
             if asked == "full" or not structure.affine
-            else " (`jj.Formulation('minimal')` uses the independent speeds, where the motion allows it)"
+            else " (`jj.Formulation('minimal')` uses the independent speeds if the motion permits it)"
         )
         return f"all its speeds are integrated, but the method needs the minimal state{way_out}"
     return ""

@@ -1,13 +1,13 @@
-"""Discrete Lagrange-d'Alembert principle (DLA), as a map from (q_0, u_0) to (q_1, u_1).
+"""Integrator by the discrete Lagrange-d'Alembert principle (DLA), as a map from (q_0, u_0) to (q_1, u_1).
 
     p^+ = -D_1 L_d(q_0, q_1) - f^-,   p^- = D_2 L_d(q_0, q_1) + f^+
 
     q_1, lambda_0:   dL/dqdot(q_0, u_0) + A(q_0)' lambda_0 = p^+,   phi_d(q_0, q_1) = 0
     u_1, lambda_1:   dL/dqdot(q_1, u_1) - A(q_1)' lambda_1 = p^-,   A(q_1) u_1 + phi_0 = 0
 
-At a node the momenta of the adjacent intervals differ only by a constraint impulse, p^+ - p^- = A' lambda:
-the DLA equations D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both therefore have the same projection onto the
-velocity constraints, which is the state between steps.
+At a node, the momenta of the adjacent intervals differ only by a constraint impulse, p^+ - p^- = A' lambda.
+These are the DLA equations D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both momenta therefore have the same
+projection onto the velocity constraints, which is the state between steps.
 
     v = (q_1 - q_0)/h,   q_m = (q_0 + q_1)/2
     midpoint:     L_d = h L(t_m, q_m, v),                         f^- = f^+ = h/2 Q(t_m, q_m, v)
@@ -86,8 +86,8 @@ def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) 
 
 
 def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
-    """Return `p^+ = -D_1 L_d - f^-` at the beginning and `p^- = D_2 L_d + f^+` at the end of the interval:
-    momenta of the unconstrained motion.
+    """Return the momenta of the unconstrained motion: `p^+ = -D_1 L_d - f^-` at the beginning of the interval
+    and `p^- = D_2 L_d + f^+` at its end.
     """
     d0, d1 = jax.grad(lambda q0, q1: discrete_lagrangian(scene, over, q0, q1, inputs), argnums=(0, 1))(q0, q1)
     if not _has_forces(scene, over.t0, q0):
@@ -106,14 +106,14 @@ def discrete_rows(
     scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int
 ) -> Float[Array, "rows"]:
     """Return all constraint residuals over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so
-    that they vanish at every node.
+    that the geometric constraints hold at every node.
     """
     rows = over.mean(lambda t, q, v: velocity_residual(scene, t, q, v, inputs(t)), q0, q1)
     return rows if geometric == 0 else rows.at[:geometric].set(position_residual(scene, over.t1, q1) / over.h)
 
 
 def _has_forces(scene: Scene, t, q) -> bool:
-    """Return whether any load has no potential, which is known while tracing."""
+    """Return whether any load has no potential. The answer is known even while tracing."""
     return any(load.potential is None for load in loads_of(scene, motion_at(scene, t, q, jnp.zeros_like(q))))
 
 
@@ -131,23 +131,23 @@ def _force(scene: Scene, t, q, u, inputs) -> Speeds:
 
 
 class DiscreteLagrangeDAlembert(FixedStepMethod):
-    """Nonholonomic integrator of the discrete Lagrange-d'Alembert principle, `simulate(...,
-    solver=DiscreteLagrangeDAlembert(step=h))`.
+    """Nonholonomic integrator by the discrete Lagrange-d'Alembert principle: `simulate(...,
+    solver=DiscreteLagrangeDAlembert(step=h))` with h in s.
 
-    `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete constraints `phi_d(q_k, q_k+1)
-    = 0`, from the scene's Lagrangian L = T - V - dS/dt (S: its `gauge`) by automatic differentiation. `rule`:
-    "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or "trapezoidal", `L_d = h/2 (L(q_0, v) + L(q_1,
-    v))`, v = (q_1 - q_0)/h, which also applies to velocity constraints. Geometric constraints hold at every
-    node; h in s. Loads without a potential enter as discrete forces. The state between steps is (q, u) with u
-    on the constraints: the momentum at the node, projected.
+    The equations are `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete constraints
+    `phi_d(q_k, q_k+1) = 0`. The discrete Lagrangian L_d follows from the scene's Lagrangian L = T - V - dS/dt
+    (S: its `gauge`) by a quadrature `rule`: "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or
+    "trapezoidal", `L_d = h/2 (L(q_0, v) + L(q_1, v))`, v = (q_1 - q_0)/h. The same rule applies to velocity
+    constraints. Geometric constraints hold at every node. Loads without a potential enter as discrete forces.
+    The state between steps is (q, u), where u is the momentum at the node, projected onto the constraints.
 
-    It has order 2, is symmetric in time, and is variational without velocity constraints; it is then
-    symplectic and preserves the momenta of symmetries. It needs speeds that are the coordinate rates, and
+    The method has order 2 and is symmetric in time. Without velocity constraints it is variational, hence
+    symplectic, and preserves the momenta of symmetries. It needs speeds that are the coordinate rates, and
     constraints linear or affine in them.
 
-    Use it for long motions of reversible scenes whose coordinates suit L: energy errors then stay bounded.
-    The energy drifts if the scene is not reversible. A gauge term changes no equation of motion, but may also
-    make the energy drift. The implicit midpoint rule does not depend on the gauge.
+    Use it for long motions of reversible scenes whose coordinates suit L: energy errors then stay bounded. If
+    the scene is not reversible, the energy drifts. A gauge term does not change the equations of motion, but
+    may also make the energy drift. The implicit midpoint rule does not depend on the gauge.
 
     Source: J. Cortes and S. Martinez, Nonholonomic integrators, Nonlinearity 14 (2001) 1365; R. McLachlan and
     M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283; J. E. Marsden and M. West, Discrete mechanics and
@@ -163,8 +163,8 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
             )
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Return the full `field` of the state, without projection because the method satisfies the
-        constraints itself. Raises ValueError if the method does not apply to the `scene`, or if another state
+        """Return the field with the full state and without projection, because the method itself satisfies
+        the constraints. Raises ValueError if the method does not apply to the scene, or if the minimal state
         was requested (`asked`).
         """
         structure, name = structure_of(scene), type(scene).__name__
@@ -183,7 +183,7 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
         return full_without_projection(field, scene, equations)
 
     def solve(self, args: tuple, t, y: Integrated, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s); `args`: as in `integrands.py`."""
+        """Return the change of the state `y` at `t` in a step `h` (s). `args`: as in `integrands.py`."""
         return _solved(args, Interval(args[4] + t, h, self.rule), y)
 
 
@@ -195,7 +195,7 @@ def _solved(args, over: Interval, y: Integrated) -> Solution:
     A0 = jax.jacfwd(lambda u: _kept(scene, velocity_residual(scene, over.t0, q0, u, inputs(over.t0))))(u0)
     p0 = momentum(scene, over.t0, q0, u0, inputs(over.t0))
     guess = jnp.concatenate([h * u0, jnp.zeros(A0.shape[0], q0.dtype)])
-    # impulses follow from coordinates, so only coordinates are judged
+    # impulses follow from coordinates, so convergence is tested for coordinates only
     scale = jnp.where(jnp.arange(len(guess)) < n, sizes(len(guess), q0, h * u0), jnp.inf)
     found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, scale)
     q1 = q0 + found.x[:n]
@@ -217,8 +217,8 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 
 def _projected(args, over: Interval, q0, q1) -> Speeds:
-    """Return speeds on the constraints with the given momentum at the end of the
-    interval, up to a constraint impulse.
+    """Return the speeds at the end of the interval that satisfy the constraints and whose momentum is p^- up
+    to a constraint impulse.
     """
     _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)

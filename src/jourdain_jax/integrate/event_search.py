@@ -1,26 +1,28 @@
-"""Search for the first stop event of a step and its time, by shorter trial steps from the last state before
-the event.
+"""Find the first event within a step and its time, by shorter trial steps from the last state before the
+event.
 
-One source serves JAX arrays and machine code (`w`, `integrate/loop/step.py`). Values of events are lists.
+The same code runs on JAX arrays and as machine code (`w`, `integrate/loop/step.py`). Values of events are
+lists.
 
-An event happens where its value falls through zero. A motion may start with a value of zero, to round-off. It
-continues if the value is positive after a first step h, raised by its rate or by a later derivative:
+An event happens where its value falls through zero. At the start of a motion, a value may be zero up to
+round-off. The motion continues if a first step h makes the value positive, by its rate or a higher
+derivative:
 
     |c_0| <= noise c_0'   or   |c_0|, |h c_0'| <= noise/h |c(h) - c_0|,   noise = eps^0.6 span
 
 c_0: value at the start; c_0': its rate; c(h): value after the step; span: time from start to end. If the
-value is not positive then, the step is halved, down to `noise`, so that the search skips the zero at the
-start. The event has happened at the start if the value is negative there or if no step raises it.
+value is not positive after the step, the step is halved, down to `noise`, so that the search skips the zero
+at the start. The event happens at the start if the value is negative there or if no step makes it positive.
 
-Let t_b be the last time before the event, and t_a a time after it. All event values are positive at t_b, or
-rise from zero there; at least one value is not positive at t_a. NaN counts as not positive. Of the values
-that are not positive at t_a, the search follows the one whose secant from t_b falls to zero first. The first
-trial uses the cubic through values and rates at both ends, later ones Chandrupatla's method (inverse
+Let t_b be the last time before the event, and t_a a time after it. At t_b all event values are positive or
+rise from zero; at t_a at least one value is not positive. NaN counts as not positive. Among the values that
+are not positive at t_a, the search follows the one whose secant from t_b reaches zero first. The first trial
+uses the cubic through values and rates at both ends; later trials use Chandrupatla's method (inverse
 quadratic interpolation if safe, otherwise bisection). If a trial finds an earlier event, the search follows
-the earlier one. If a value stays zero after the event, that end of the bracket counts as negative, and the
-bracket is halved.
+that event. If a value stays zero after the event, that end of the bracket counts as negative, and the bracket
+is halved.
 
-Trial times have no derivatives. Near the event, Newton shifts follow,
+Trial times have no derivatives. Close to the event, Newton shifts follow,
 
     t <- t - c/cdot,   y <- y + (shift of t) f
 
@@ -62,8 +64,8 @@ def _each(w, condition, a: Values, b: Values) -> tuple:
 
 
 class Search(NamedTuple):
-    """Bounds of the event's time: three times with the values of all events. They are the last trial, a time
-    on the other side of the event, and an earlier bound."""
+    """Bounds of the event's time: three times with the values of all events there. They are the last trial, a
+    time on the other side of the event, and an earlier bound."""
 
     t: Values
     c: Any
@@ -74,12 +76,12 @@ class Search(NamedTuple):
 
     @property
     def trying(self):
-        """Return whether trials start at the last state before the event, rather than Newton shifts."""
+        """Return whether the search makes trial steps; otherwise it makes Newton shifts."""
         return self.left > DIFFERENTIABLE + 1.0
 
 
 def search_of(form: Form, p: Lanes) -> Search:
-    """Return the search in the rows of lanes."""
+    """Return the search that the rows of the lanes store."""
     values, count = p.every("search_c"), form.events
     c = tuple(values[i * count : (i + 1) * count] for i in range(3))
     step, left, shift = (p[f"search_{name}"] for name in ("step", "left", "shift"))
@@ -89,11 +91,12 @@ def search_of(form: Form, p: Lanes) -> Search:
 def _follow(
     w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple
 ) -> Number:
-    """Advance the search in lanes where it `changes`, by a step with its `start` and `end` (time,
-    values of all events, rates). `begins`: whether the event is in this step. Returns the index of the
-    event that the search follows."""
+    """Advance the search in the lanes where it `changes`, by a step with its `start` and `end` (time, values
+    of all events, rates). `begins`: whether the search begins with this step. Return the index of the event
+    that the search follows.
+    """
     old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
-    # narrowed bracket: the trial time, one on the other side of the event, and one of the former two
+    # narrowed bracket: the trial time, a time on the other side of the event, and one of the previous two
     same = ~(no_event(c_1) ^ no_event(old.c[0]))
     narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
     narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
@@ -146,9 +149,9 @@ def monitored(
     h: Number,
     accept: Number,
 ) -> dict[str, Number]:
-    """Return the result of a step `h` that may contain an event, or in which an event is being located;
-    update `y1`. `k`: rates at its ends; `new`: time, step size, code and counts after it; `accept`:
-    whether it is a step of the motion."""
+    """Return the result of a step `h` that may contain an event, or in which an event is being located, and
+    update the state `y1` after it. `k`: rates at its ends; `new`: time, step size, code and counts after it;
+    `accept`: whether it is an accepted step of the motion (not a trial)."""
     count, y, t = form.events, p.pointer, p["t"]
 
     def events(t: Number, y: Number, slope: Number) -> list[list[Number]]:
@@ -157,7 +160,7 @@ def monitored(
         return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
     def armed(found: list[list[Number]]) -> list[list[Number]]:
-        """Exclude ignored events, and events whose value has not left zero since they happened."""
+        """Exclude ignored events, and events whose value has not left zero since the event last happened."""
         if not form.goes_on:
             return found
         found = leaving(w, form, p, found)
@@ -169,8 +172,8 @@ def monitored(
         ]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of values that have not left zero since their event: a value that rises and falls
-        again in one step is a new event.
+        """Reverse the sign of values that have not left zero since their event. A value that rises and falls
+        again within one step is then found as a new event.
         """
         if not form.goes_on:
             return found
@@ -213,8 +216,8 @@ def monitored(
 
     w.if_any(changes, follow)
     search = search_of(form, p)
-    # trials start at the last state before the event; a step over a dip is repeated up to the bottom of the
-    # dip
+    # trials start at the last state before the event; a step over a dip of a value is repeated up to the
+    # lowest value
     found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
     over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
     stays = back | dips | restarts | over
@@ -284,16 +287,16 @@ def monitored(
 
 
 def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
-    """Return whether the value of a lane's event has no slope where it falls through zero."""
+    """Return whether the value of a lane's event has zero slope where it falls through zero."""
     return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
 
 
 def put_tangents(
     w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number
 ) -> None:
-    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates. Each tangent
-    of time shifts the state along its directions e. Values and rates are taken before the event; without
-    slope the tangents are NaN.
+    """Store the tangents of the time t of an event and of the state `y1` there. `k`: the rates. Each tangent
+    of time shifts the state along its directions e. Values and rates are those before the event. If the value
+    has zero slope, the tangents are NaN.
 
         dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0"""
     count, times = form.events, form.rows["dt"]

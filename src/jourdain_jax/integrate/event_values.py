@@ -1,5 +1,6 @@
-"""Formulas of the event search on values at the ends of a step: the first event, the time at which a value
-falls through zero, and the next trial time. `event_search.py` has the method and its source.
+"""Formulas of the event search. From values at the ends of a step they compute the first event, the time at
+which a value falls through zero, and the next trial time. `event_search.py` describes the method and its
+source.
 """
 
 import math
@@ -7,10 +8,10 @@ import operator
 from functools import reduce
 from typing import Any
 
-# a value that falls through zero at less than this part of its mean rate counts as a multiple root
+# a value whose rate at zero is less than this part of its mean rate counts as a multiple root
 FLAT = 1e-8
-LEAVES = 0.6  # exponent of round-off
-LATE = 0.98  # fraction of a step: a later dip is left to the next step
+LEAVES = 0.6  # exponent of round-off, in the noise of times
+LATE = 0.98  # fraction of a step; the next step finds later dips
 Values = Any  # one per event
 
 
@@ -20,12 +21,12 @@ def any_of(found: Values):
 
 
 def no_event(values: Values):
-    """Return whether all values are positive, which NaN is not."""
+    """Return whether all values are positive. NaN is not positive."""
     return reduce(operator.and_, [c > 0.0 for c in values])
 
 
 def chosen(w, index, values: Values):
-    """Return the value with this index, by default the first."""
+    """Return the value with this index; for an invalid index, the first."""
     found = values[0]
     for i in range(1, len(values)):
         found = w.where(w.equal(index, i), values[i], found)
@@ -33,13 +34,13 @@ def chosen(w, index, values: Values):
 
 
 def reach_of_noise(w, span):
-    """Return the time after which a rising value exceeds the round-off of a zero at the start."""
+    """Return the time after which a value that rises from zero at the start exceeds its round-off."""
     return w.eps**LEAVES * w.magnitude(span)
 
 
 def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -> tuple[list, list]:
-    """Return which events happened at a start, and which values are near zero there and not positive after a
-    step `h`.
+    """Return which events happen at the start, and which values rise from zero there but are not positive
+    after a step `h`.
     """
     sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
@@ -53,7 +54,7 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -
 
 
 def first_event(w, before: Values, after: Values):
-    """Return the index of the first event to happen, by its secant."""
+    """Return the index of the first event within a step: its secant is the first to reach zero."""
     best, first = None, 0.0
     for i, (b, a) in enumerate(zip(before, after, strict=True)):
         share = b / (b - a)
@@ -65,14 +66,15 @@ def first_event(w, before: Values, after: Values):
 
 
 def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of a + m s + A s^2 + B s^3 from values and rates at s = 0 and
-    s = 1, the ends of a step h."""
+    """Return m, A, B of the cubic a + m s + A s^2 + B s^3 with given values and rates at the ends of a step
+    h, s = 0 and s = 1.
+    """
     m_0, m_1, rise = h * slope_a, h * slope_b, b - a
     return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
 
 
 def falls_through(w, h, a, slope_a, b, slope_b):
-    """Return the fraction of a step at which the cubic, or else the straight line, falls to zero."""
+    """Return the fraction of a step at which the cubic is zero, or, if its root is not found, the secant."""
     m, A, B = cubic(h, a, slope_a, b, slope_b)
     s = line = a / (a - b)
     for _ in range(4):
@@ -82,9 +84,10 @@ def falls_through(w, h, a, slope_a, b, slope_b):
 
 
 def trial(w, t, c, step, last, guess) -> tuple:
-    """Return the next trial time in a step of length `step`, and whether the last one is near enough. `t` and
-    `c` are times and values of a bracket. The first trial divides it by the fraction `guess`. With `last` the
-    search ends at a finite value."""
+    """Return the next trial time in a step of length `step`, and whether the last trial is near enough. `t`
+    and `c` are times and values of a bracket. The first trial divides the bracket at the fraction `guess`. If
+    `last`, the search ends, provided that the value is finite.
+    """
     eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
@@ -96,15 +99,15 @@ def trial(w, t, c, step, last, guess) -> tuple:
     share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
-    # The trial is near enough if the value is near zero in time, by the slope, and small relative to the
-    # other end. One condition alone fails for flat or jumping values; so does the mean slope of a step before
-    # any trial.
+    # A trial is near enough if the value, divided by the slope, is a short time, and if the value is small
+    # relative to that at the other end. Either condition alone fails for flat or jumping values. So does the
+    # mean slope of the whole step, which is the only slope known before any trial.
     slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
     slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
     small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (
         w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2)
     )
-    zero = w.equal(c_1, 0.0)  # at the event, or beyond it if the value stays zero
+    zero = w.equal(c_1, 0.0)  # at the event, or after it if the value stays zero
     near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
     closed = (w.magnitude(width) <= 2.0 * tiny) | last
     clipped = w.smaller(w.larger(share, least), 1.0 - least)
@@ -112,13 +115,16 @@ def trial(w, t, c, step, last, guess) -> tuple:
 
 
 def is_flat(w, c_dot, slope):
-    """Return whether a value has no slope at its zero, relative to its mean `slope` over the step."""
+    """Return whether the slope of a value at its zero is negligible relative to its mean `slope` over the
+    step.
+    """
     return w.magnitude(c_dot) <= FLAT * slope
 
 
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
-    """Return the fraction of a step `h` at the bottom of the first dip below zero between its ends; 1 without
-    a dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0)).
+    """Return the fraction of a step `h` at which the first dip below zero between its ends is lowest; 1 if
+    there is no dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B
+    m_0)).
     """
     share = None
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
@@ -132,8 +138,8 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half of the fraction of a step `h` in which values that rise from zero stay positive; at most a
-    half.
+    """Return half of the fraction of a step `h` during which values that rise from zero stay positive, at
+    most one half.
     """
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):

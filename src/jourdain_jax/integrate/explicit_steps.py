@@ -7,10 +7,11 @@
             L. F. Shampine, Math. Comp. 46 (1986) 135
     Dopri8: P. J. Prince and J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67, order 8, estimate of order 7
 
-Names and coefficients equal those of diffrax's solvers to the last bit. A motion is thus the same in either
-loop, and the defaults do not need diffrax. The weights of the solution are also the last row of A: the last
-stage of a step is the first of the next one. The formulas for step sizes serve implicit methods, too. Their
-argument `w`, the writer of a step (`integrate/loop/step.py`), makes them serve JAX arrays and machine code.
+Names and coefficients equal those of diffrax's solvers to the last bit, so that a motion is the same in
+either loop and the default solvers do not need diffrax. The weights of the solution are also the last row of
+A, so that the last stage of a step is the first stage of the next. Implicit methods use the same formulas for
+step sizes. The argument `w`, the writer of a step (`integrate/loop/step.py`), evaluates the formulas on JAX
+arrays or writes them as machine code.
 """
 
 import math
@@ -38,7 +39,7 @@ SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """Runge-Kutta tableau. Its stages run as a loop, so that the vector field is compiled only once."""
+    """Runge-Kutta tableau. Stages run in a loop, so that the vector field is compiled only once."""
 
     name: str
     order: int
@@ -46,23 +47,23 @@ class Method:
     b: np.ndarray
     b_error: np.ndarray
     c: np.ndarray
-    even: ClassVar[bool] = False  # whether it takes equal steps
+    even: ClassVar[bool] = False  # whether steps have equal length
 
     @property
     def needed(self) -> int:
-        """Return the number of stages of a step, without an unused last one."""
+        """Return the number of stages of a step, excluding a last stage that is not used."""
         at_y_1 = np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0
         return len(self.c) - int(at_y_1 and self.b_error[-1] == 0)
 
     @property
     def at_the_end(self) -> int:
-        """Return the index of the last stage at the end of a step, or of the last stage if none is there."""
+        """Return the index of the last stage at the end of a step; if there is none, of the last stage."""
         return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
-    """Return a method from its nodes, the rows of A and the weights of its embedded method,
-    all without the first stage.
+    """Return a method from its nodes and rows of A, both without the first stage, and the weights of its
+    embedded method.
     """
     stages = len(c) + 1
     A = np.zeros((stages, stages))
@@ -145,7 +146,9 @@ _ALL = {method.name: method for method in (TSIT5, DOPRI5, DOPRI8)}
 
 
 def method_of(solver) -> Method | None:
-    """Return the method of a diffrax solver; None if this package's loop does not support it."""
+    """Return the method that equals a diffrax solver; None if this package's loop does not support the
+    solver.
+    """
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
 
@@ -160,8 +163,9 @@ class Aim(NamedTuple):
 
 
 def aimed(w, p, target, reach, shift) -> Aim:
-    """Return the next step: to the `target` if a step of length `reach` suffices, half of the way if two
-    suffice, otherwise of length `reach`. `shift`: the step of an event search, if active.
+    """Return the next trial step: to the `target` if a step of length `reach` suffices, half of the way if
+    two such steps suffice, otherwise of length `reach`. `shift`: the step of an event search, if there is
+    one.
     """
     locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
     lands = ~locating & (reach >= 0.999 * rest)
@@ -172,7 +176,7 @@ def aimed(w, p, target, reach, shift) -> Aim:
 
 
 def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
-    """Return whether a step with this `error` is accepted, and the next step."""
+    """Return whether a step with this `error` is accepted, and the length of the next step."""
     accept = aim.locating | (error <= 1.0)
     factor = SAFETY * power(w.where(error > 0.0, error, 1e-30), -1 / order)
     factor = w.larger(w.where(error < math.inf, factor, 0.0), LEAST_FACTOR)
@@ -181,10 +185,10 @@ def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
 
 
 def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
-    """Return time, next step, code and counts after a step."""
+    """Return the time, the length of the next step, the code and the counts after a step."""
     accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
     rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
-    # the second: time would not advance
+    # the second condition: time would not advance
     too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)
     arrived = accept & w.equal(aim.t_1, p["last_goal"])
     code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, result_codes.MAX_STEPS, RUNNING)
@@ -199,8 +203,8 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
 
 
 def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """Return the result code of a motion that ends after `span`, when every requested time has been reached.
-    `h`: the length of the next step.
+    """Return the result code at the end of the loop, from its last `code`. `h`: length of the next step;
+    `span`: time since the start.
     """
     # steps that shrank below 0.01 of their average indicate a singularity
     shrank = (code == result_codes.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
@@ -208,7 +212,7 @@ def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
 
 
 def off(where: Callable, magnitude: Callable, x, rtol, atol):
-    """Return a number of a state that is larger by the error which a step may have."""
+    """Return an entry of a state, increased in magnitude by the tolerance of a step."""
     return x + where(x < 0.0, -1.0, 1.0) * (atol + rtol * magnitude(x))
 
 
@@ -216,20 +220,19 @@ LEAST_ORDER, MOST_ORDER = 4, 30
 
 
 class Taylor(eqx.Module):
-    """Taylor series of the motion, `simulate(..., solver=jj.Taylor())`: for small scenes, tight
-    tolerances, and many saved times.
+    """Integration by Taylor series, `simulate(..., solver=jj.Taylor())`: for small scenes, tight tolerances,
+    and many saved times.
 
-    y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, in machine code of the CPU. The
-    default order is p = ceil(1 - log(rtol)/2); the length of a step keeps its last two terms within the
-    tolerance (Jorba and Zou). Saved states come from the series, so steps do not end there. Compared with
-    Dopri8 at equal error, a single Chaplygin sleigh takes half of the time at 1e-12; scenes with some
-    hundred operations take longer.
+    y(t + s) = sum_{k=0}^p y_k s^k, where recurrences give the coefficients, in machine code of the CPU. The
+    default order is p = ceil(1 - log(rtol)/2). The length of a step keeps the last two terms within the
+    tolerance (Jorba and Zou). Saved states are evaluated from the series, so steps need not end there.
+    Compared with Dopri8 at equal error, a single Chaplygin sleigh takes half of the time at 1e-12; scenes
+    with a few hundred operations take longer.
 
-    **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`. **Raises** from `simulate`:
-    ValueError without machine code, for sampled inputs, and for equations that branch or are too
-    long. Derivatives: forward mode also by series, or by Dopri8 if the series of second derivatives
-    are too long; reverse mode integrates the motion again by Dopri8. Source: A. Jorba and M. Zou,
-    Experimental Mathematics 14 (2005) 99.
+    **Arguments:** `order`, from 4 to 30; None: chosen by the tolerance `rtol`. **Raises** ValueError from
+    `simulate` without machine code, for sampled inputs, and for equations that branch or are too long.
+    Forward mode also uses series, or Dopri8 if the series of second derivatives are too long. Reverse mode
+    integrates the motion again by Dopri8. Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99.
     """
 
     order: int | None = static(default=None)
@@ -242,12 +245,12 @@ class Taylor(eqx.Module):
         ):
             raise ValueError(
                 f"`order` is {self.order!r}, expected a whole number from {LEAST_ORDER} to {MOST_ORDER}, or"
-                " None to choose it by the tolerance"
+                " None to let the tolerance determine it"
             )
 
 
 def order_for(rtol: Number) -> int:
-    """Return p = ceil(1 - log(rtol)/2), which minimises the cost per unit of time."""
-    # assumed for a traced tolerance
+    """Return the order p = ceil(1 - log(rtol)/2), which minimises the cost per unit of time."""
+    # 1e-12 is assumed for a traced tolerance
     tolerance = 1e-12 if is_traced(rtol) else float(rtol)
     return min(max(math.ceil(1 - math.log(tolerance) / 2), LEAST_ORDER), MOST_ORDER)

@@ -1,15 +1,16 @@
-"""Knots of sampled inputs, at which steps end.
+"""Choose the knots of sampled inputs at which steps end.
 
-A step evaluates an input only a few times and could miss a short feature at any tolerance. `Sampled`
-inputs are piecewise linear with knots at their sample times. Steps end at knots, so every step has a smooth
-input. Knots may be skipped where the remaining polygon deviates from them by at most
+A step evaluates an input only a few times and could miss a short feature at any tolerance. `Sampled` inputs
+are piecewise linear with knots at their sample times. Steps end at knots, so that the input is smooth within
+each step. A knot is skipped if the polygon through the other knots deviates from it by at most
 
     max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
 
-Knots are chosen greedily: lines from one to the next must pass all knots in between within that distance.
+Knots are chosen greedily: the line from one to the next must pass all knots in between within that distance.
 
-Both steps at a knot evaluate the input there. Each takes derivatives with respect to time and knot times from
-the line on its own side (`SeenFromWithin`), so step ends need not move with the knots.
+The steps before and after a knot both evaluate the input there. Each step takes derivatives with respect to
+time and knot times from the line on its own side (`SeenFromWithin`), so that ends of steps need not move with
+the knots.
 """
 
 import equinox as eqx
@@ -22,8 +23,8 @@ from jourdain_jax.integrate.inputs import Inputs, Sampled
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
-    """Return the knots of all samples in `holders` at which steps must end: times since `t0`, in the order of
-    the motion, without the times `ts`. At least one infinite time follows. None without samples.
+    """Return the knots of all `Sampled` in `holders` at which steps must end: times since `t0`, in the order
+    of the motion, excluding the times `ts`. At least one infinite time follows. None if there are no samples.
     """
     samples = [
         x
@@ -34,7 +35,7 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
         return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
     direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
-    # tolerance of the polygon relative to the range of values; times nearer than 1e-12 of the span coincide
+    # tolerance of the polygon, relative to the range of values; times closer than 1e-12 of the span coincide
     share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
     # the choice of knots has no derivative, but their times do
     since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
@@ -53,14 +54,15 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """Return whether steps must end at each sample, so that straight lines between such samples deviate from
-    the others by at most `share` of the range of values.
+    """Return at which samples steps must end: straight lines between these samples deviate from the others by
+    at most `share` of the range of values.
     """
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
     def next_knot(carry, here):
-        t_a, v_a, t_b, v_b, low, high = carry  # anchor, last knot, range of slopes that pass all knots since
+        # anchor, last knot, and the range of slopes from the anchor that pass all knots since
+        t_a, v_a, t_b, v_b, low, high = carry
         t_k, v_k = here
         slope = (v_k - v_a) / (t_k - t_a)
         straight = (slope >= low) & (slope <= high)
@@ -72,21 +74,21 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
 
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
-    # `bent` at a knot: a step ends at the knot before
+    # if `bent` at a knot, a step ends at the previous knot
     return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
 
 
 class SeenFromWithin(eqx.Module):
-    """Sampled input within one step: at a knot it continues the line of this step."""
+    """Sampled input within one step. At a knot it uses the line of this step, not that of the next."""
 
     sampled: Sampled
-    middle: PerLane  # middle of the step, s; infinite if there is none
+    middle: PerLane  # middle of the step, s; infinite if there is no step
 
     def __call__(self, t):
         """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
         ts, values = self.sampled.ts, self.sampled.values
         at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
-        # shift t towards the middle of the step, by 2.0**-10 of the distance, to select the side of a knot
+        # to select the side of a knot, shift t towards the middle of the step, by 2.0**-10 of the distance
         at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
         k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
         after = jnp.minimum(k + 1, len(ts) - 1)
@@ -97,7 +99,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` whose samples continue the line of the step around `middle` (s; infinite: no step)."""
+    """Return `inputs` with samples as within the step around `middle` (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

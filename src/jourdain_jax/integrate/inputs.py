@@ -1,4 +1,4 @@
-"""Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
+"""Inputs of a scene as functions of time: constants, callables, or linearly interpolated samples.
 
 Functions become programs (`time_programs.py`); steps end at the knots of samples (`input_knots.py`).
 """
@@ -34,11 +34,12 @@ from jourdain_jax.structure.structure import structure_of
 
 
 class Sampled(eqx.Module):
-    """Input with `values` at given times `ts` (s, increasing), linear between, constant beyond.
+    """Input with `values` at given times `ts` (s, increasing): linear between them, constant before the first
+    and after the last.
 
-    Steps end at its knots, so no feature is missed, however short. Knots on a straight line between others
-    are skipped, to within a tenth of `rtol` (at most 1e-5) of the range of values. A rough signal costs a
-    step per sample. Other functions of time are evaluated only at the times of steps.
+    Steps end at the sample times, so that no feature is missed, however short. Samples on a straight line
+    between others are skipped; the tolerance is a tenth of `rtol` (at most 1e-5) of the range of values. A
+    rough signal costs one step per sample. Other functions of time are evaluated only at the times of steps.
     """
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
@@ -63,7 +64,7 @@ class Constant(eqx.Module):
 
 
 class Mode(eqx.Module):
-    """Mode as an input: the number of its value at the start, and after each transition."""
+    """Mode as an input: the index of its value at the start and after each transition."""
 
     value: Float[Array | np.ndarray, ""]
     ts: Float[Array, "transitions"] | None = None  # s, times `direction`; infinite after the last one
@@ -71,7 +72,7 @@ class Mode(eqx.Module):
     direction: Float[Array, ""] | None = None  # 1, or -1 if time runs backwards
 
     def __call__(self, t):
-        """Return the number at time t; at a transition, the one after it."""
+        """Return the index of the value at time t; at a transition, that of the new value."""
         if self.ts is None or self.values is None:
             return self.value
         known = stopped((self.ts, t * self.direction))
@@ -80,7 +81,7 @@ class Mode(eqx.Module):
 
 
 class Inputs(eqx.Module):
-    """All inputs of a scene, in order; `inputs(t)` is their vector."""
+    """All inputs of a scene, in order. `inputs(t)` returns their values as a vector."""
 
     channels: tuple[Callable, ...]
 
@@ -101,7 +102,7 @@ class Inputs(eqx.Module):
         return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
-        """Return values and rates at time t. Raises ValueError for functions without derivatives."""
+        """Return values and rates at time t. Raises ValueError if an input cannot be differentiated."""
         t = jnp.asarray(t, real_type())
         try:
             values, rates = jax.jvp(self, (t,), (jnp.ones_like(t),))
@@ -120,7 +121,7 @@ def in_phases(
     modes: Float[Array | np.ndarray, "modes transitions"],
     direction,
 ) -> Inputs:
-    """Return inputs whose modes change at each transition; missing transitions are at infinity."""
+    """Return inputs whose modes change at the transitions `ts`; unused entries of `ts` are infinite."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
@@ -132,7 +133,7 @@ def in_phases(
 
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
-    """Return the vector of inputs at time t, in NumPy or compiled if all values are concrete."""
+    """Return the vector of inputs at time t. Concrete values are computed by NumPy or a compiled function."""
     if inputs.channels and is_traced(inputs, t):
         return inputs(t)
     if inputs.constant:
@@ -144,11 +145,11 @@ _compiled_inputs = for_programs(lambda inputs, t: inputs(t))
 
 
 _NOTHING = object()
-_ZERO = Constant(np.zeros(()))  # made once, because a module takes some 20 us
+_ZERO = Constant(np.zeros(()))  # shared, because making a module takes some 20 us
 
 
 def _as_channel(f: Callable, where: str) -> Callable:
-    """Return a function of time as an input channel; ValueError unless `f` maps a time to one number."""
+    """Return a function of time as an input channel. Raises ValueError if `f` does not return one number."""
     advice = "pass a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
         channel, found = traced(f, real_type())
@@ -168,7 +169,9 @@ def _as_channel(f: Callable, where: str) -> Callable:
 
 
 def as_inputs(scene: Scene, given) -> Inputs:
-    """Return inputs from name -> number, function of time or `Sampled`; omitted ones are zero."""
+    """Return the inputs of a scene from a dictionary by name: numbers, functions of time or `Sampled`.
+    Omitted inputs are zero.
+    """
     if isinstance(given, Inputs):
         if len(given.channels) != len(scene.inputs):
             raise ValueError(
@@ -178,8 +181,8 @@ def as_inputs(scene: Scene, given) -> Inputs:
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(
-            f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or"
-            " `jj.Sampled`"
+            f"`inputs` is {described(given)}, expected a dictionary of numbers, functions of time, or"
+            " `jj.Sampled` by name"
         )
     if not given and not scene.modes.pairs:
         return Inputs((_ZERO,) * len(scene.inputs))
@@ -213,7 +216,7 @@ def as_inputs(scene: Scene, given) -> Inputs:
 
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
-    """Raise ValueError for an input of velocity constraints that jumps between t0 and t1."""
+    """Raise ValueError if velocity constraints depend on a mode, or on an input that jumps in the span."""
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):

@@ -1,8 +1,8 @@
-"""Integrands of the loops: rates, projection and events as functions of (tau, y, args),
-for one motion and for batches.
+"""Integrands of the loops: rates, projection and events as functions of (tau, y, args), for one motion or a
+batch.
 
-`args`: the vector field, the scene, its inputs, the scene's part of the rates, and the origin of tau; for
-batches with the batch axis first.
+`args`: the vector field, the scene, its inputs, the part of the rates that depends on parameters only, and
+the origin of tau. Of a batch, they have the batch axis first.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, Vect
 
 
 def state_norm(y: Integrated) -> PerLane:
-    """Return the root mean square over coordinates and speeds. Integrated work does
+    """Return the root mean square over coordinates and speeds. Integrated work is excluded, so that it does
     not influence the step size.
 
-    NaN counts as infinite, so that the step shrinks until the motion ends instead of using up all steps.
+    NaN counts as infinite. Steps then shrink until the motion ends, instead of using up all steps.
     """
     squared = sum(jnp.sum(part**2, axis=0) for part in (y.q, y.v)) / (len(y.q) + len(y.v))
     squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
@@ -28,8 +28,8 @@ def state_norm(y: Integrated) -> PerLane:
 
 
 def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorField, Instant]:
-    """Return the vector field, and its arguments at a state. With `of_rates`, return only the arguments of
-    the rates. The batch axis is last.
+    """Return the vector field and its arguments at a state. With `of_rates`, inputs are as the rates need
+    them (`VectorField.now`). The batch axis is last.
     """
     field, scene, inputs, fixed, origin = args
     t = origin + tau
@@ -39,8 +39,8 @@ def at_time(tau, y: Integrated, args, of_rates: bool = False) -> tuple[VectorFie
 
 
 def _lane_by_lane(knows_lanes: Callable[[VectorField], bool]) -> Callable:
-    """Return a decorator for functions of (tau, y, args) that maps them over a batch
-    unless the field supports batches.
+    """Return a decorator that maps a function of (tau, y, args) over a batch, unless the field supports
+    batches.
     """
 
     def decorated(function: Callable) -> Callable:
@@ -87,12 +87,12 @@ def resets(tau, y, args) -> Float[Array, "events rows *lanes"]:
 
 @_lane_by_lane(lambda field: field.lowered is not None)
 def energy(tau, y, args) -> PerLane:
-    """Return T + V, J, without derivatives."""
+    """Return T + V (J). It has no derivatives."""
     field, at = at_time(tau, y, args)
     return jnp.sum(field.energies(at), axis=0)
 
 
 def within(middle, args):
-    """Return `args` for the stages of a step with this middle."""
+    """Return `args` for the stages of the step around the time `middle`."""
     field, scene, inputs, fixed, origin = args
     return field, scene, seen_from_within(inputs, origin + middle), fixed, origin

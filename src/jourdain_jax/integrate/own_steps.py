@@ -1,5 +1,5 @@
-"""This package's loop over steps as an integrator with derivatives: by machine code if possible, otherwise in
-JAX, where batches of a scalar program run in blocks of `width` samples.
+"""Integrator by this package's loop over steps, with derivatives. It runs as machine code if possible,
+otherwise in JAX, where batches of a scalar program run in blocks of `width` samples.
 """
 
 from collections.abc import Callable
@@ -44,17 +44,19 @@ from jourdain_jax.scene.scene import Scene
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class OwnSteps(Integrator):
-    """This package's loop over steps, by a Runge-Kutta tableau, an implicit method or Taylor series."""
+    """Loop over steps by a Runge-Kutta tableau, an implicit method or Taylor series."""
 
     solver: Method | ImplicitMethod
-    alongside: bool  # whether one run gives values and tangents, for `jvp` and `jacfwd` only
+    alongside: bool  # compute values and tangents in one run; for `jvp` and `jacfwd` only
     max_steps: int
     event_names: tuple[str, ...]
     native: bool  # whether machine code may integrate
-    order: int | None  # order of the Taylor series, which machine code uses instead of the solver's tableau
+    order: (
+        int | None
+    )  # order of Taylor series, which machine code uses in place of the tableau; None: tableau
     memory: int  # limit in bytes for the record of reverse mode
     most: int  # maximum number of events after which a motion continues
-    stopping: bool  # whether other events end it
+    stopping: bool  # whether stop events end a motion
     own: ClassVar[bool] = True
 
     @property
@@ -85,7 +87,7 @@ class OwnSteps(Integrator):
         return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
 
     def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
-        """Return the loop in JAX, its arguments, and the number of samples per block."""
+        """Return the loop in JAX, its arguments, and the number of samples per block (0: no blocks)."""
         program = setup.field.lowered
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
         return *on_arrays.loop_of(self.solver, setup, begun, self._events(setup)), at_once
@@ -97,7 +99,7 @@ class OwnSteps(Integrator):
     def _pulled_on_arrays(
         self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved
     ) -> tuple:
-        """Return cotangents of varying values from the cotangents of the motion."""
+        """Return the cotangents of varying values from the cotangents `g` of the motion."""
         setup, begun = arguments
         of, start, at_once = self._loop(setup, begun)
         varies = [
@@ -125,7 +127,7 @@ class OwnSteps(Integrator):
         return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
 
     def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Return cotangents of varying values from the cotangents of the motion."""
+        """Return the cotangents of varying values from the cotangents `g` of the motion."""
         setup, begun = arguments
         sampled = [
             channel
@@ -157,8 +159,8 @@ class OwnSteps(Integrator):
 def _by_start(
     perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]
 ) -> tuple:
-    """Return cotangents of a setup and of its start from the cotangents of the state
-    and of the rates' arguments.
+    """Return the cotangents of a setup and its start from those of the initial state and of the rates'
+    arguments.
     """
     by_setup, by_begun = jax.tree.map(
         lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments
@@ -169,22 +171,22 @@ def _by_start(
 
 
 def own_steps(solver, **static) -> OwnSteps | None:
-    """Return this package's loop if it supports the solver, otherwise None (use diffrax)."""
+    """Return this package's loop if it supports the solver; otherwise None, and diffrax is used."""
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None
     if isinstance(method, FixedStepMethod):
-        # another step size needs no other program
+        # without the step, so that a new step size needs no compilation
         method = eqx.tree_at(lambda method: method.step, method, None)
     return OwnSteps(method, **static)
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
-    """Return the motion of `run` with derivatives with respect to the setup's times. The times of `run` have
-    no derivatives, so start and saved states are shifted to the setup's times.
+    """Return the motion of `run`, with derivatives with respect to the setup's times. Times within `run` have
+    no derivatives; therefore, the start and the saved states are shifted to the setup's times.
 
-    A reached time equals its goal; the loop itself gives the time of a stop event. A time that was not
-    reached keeps its distance from the start.
+    A time that was reached equals its goal. The loop itself computes the time of a stop event. Any other end
+    time keeps its distance from the start.
     """
     numbers = jax.lax.stop_gradient
     alone = setup.at(begun.plain.times if begun.plain else numbers(setup.times))
@@ -198,9 +200,7 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
 
 
 def _moved(mover: Callable, found: Solved, args: tuple, times: Times, ts) -> Solved:
-    """Return a motion with derivatives with respect to its times; `ts`: the saved times without
-    derivatives.
-    """
+    """Return a motion with derivatives with respect to its times. `ts`: saved times without derivatives."""
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, args
     goals, later = times.goals, start - numbers(start)
     passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
@@ -225,8 +225,8 @@ def _moved(mover: Callable, found: Solved, args: tuple, times: Times, ts) -> Sol
 
 
 def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
-    """Return the motion with a mode and an event for each relation (`lowering/sides.py`), and with functions
-    of time merged into its program.
+    """Return the motion with a mode and an event for each relation, such as `a < b` (`lowering/sides.py`),
+    and with functions of time merged into its program.
     """
     field, inputs = setup.field, begun.args[2]
     if _reason_against_sides(setup) or not isinstance(field, ByProgram):
@@ -253,18 +253,16 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 
 def reason_against_watching(setup: Setup) -> str:
-    """Return why steps do not monitor all relations of a scene's loads or stop events; empty if they do, or
-    there are none. Parts kept as JAX calls may hide relations.
+    """Return why relations in loads or stop events are not all monitored; empty if they are, or if there are
+    none. Parts that remain JAX calls may contain relations that are not known.
     """
     program = setup.field.lowered
     hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
-    return _reason_against_sides(setup) or ("the scene keeps parts as calls" if hides else "")
+    return _reason_against_sides(setup) or ("parts of the scene are JAX calls" if hides else "")
 
 
 def _reason_against_sides(setup: Setup) -> str:
-    """Return why steps do not monitor the relations of the scalar program; empty
-    if they do, or there are none.
-    """
+    """Return why relations of the scalar program are not monitored; empty if they are or there are none."""
     if setup.field.lowered is None:
         jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
         return "the scene has no scalar program" if jump else ""
@@ -274,27 +272,27 @@ def _reason_against_sides(setup: Setup) -> str:
     if not numbers:
         return ""
     if not setup.integrator.own:
-        return "solvers of diffrax do not"
+        return "the solver is a diffrax solver"
     if getattr(setup.integrator.solver, "even", False):
-        return "fixed-step methods do not"
+        return "the method has fixed steps"
     if has_events and not setup.field.lowers_events:
         return "an event has no scalar form"
     if any(program.graph.op[n] in ARRAYS for n in program.fixed):
-        return "the scene keeps parts as calls"
+        return "parts of the scene are JAX calls"
     sampled = [
         n
         for n, channel in zip(program.traced.inputs.tolist(), others_of(setup.inputs), strict=True)
         if isinstance(channel, Sampled)
     ]
     if set(sampled) & set(program.graph.reachable(numbers)):
-        return "one depends on samples"
+        return "one depends on a sampled input"
     return f"there are {len(numbers)}, more than {MOST_WATCHED}" if len(numbers) > MOST_WATCHED else ""
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
-    """Return whether rates may jump at a time whose derivatives are neglected: a time that
-    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`:
-    whether steps end at relations.
+    """Return whether rates may jump at a time that varies and whose derivatives are neglected. Such a time
+    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`: relations are
+    monitored.
     """
     traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
     if field.lowered is None:
@@ -323,19 +321,20 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, Indices]:
-    """Return the program, with functions of time merged into it, and its relations."""
+    """Return the program with functions of time merged into it, and the numbers compared by its relations."""
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
 
 
 def width(program: Lowered) -> int:
-    """Return the number of samples of a lowered scene that run in lockstep.
+    """Return the number of samples of a lowered scene that run together in one block.
 
-    A block lasts until its slowest sample ends, and its data should fit a core's fastest cache. Small blocks
-    are therefore best if they have little overhead. On a CPU they have little if XLA compiles the whole loop
-    into one function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise XLA starts
-    every operation separately, and many samples must share that cost.
+    A block runs until its slowest sample ends, and its data should fit a core's fastest cache. Small blocks
+    are therefore best if their overhead is small. On a CPU it is small if XLA compiles the whole loop into
+    one function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise XLA starts each
+    operation separately, and many samples must share that cost.
     """
-    # larger loops use too much memory to become one function (the bicycle, with 2016 operations, still does)
+    # larger loops use too much memory to become one function; the bicycle, with 2016 operations, still
+    # becomes one
     return 8 if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

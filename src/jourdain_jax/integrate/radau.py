@@ -4,8 +4,8 @@
     e = (1 - h g J)^-1 (g h f(t_0, y_0) + g/3 (-13 - 7 sqrt 6, -13 + 7 sqrt 6, -1) . z)
     J = df/dy,   1/g: the real eigenvalue of A^-1
 
-The stages are collocation at the Radau nodes c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1). The estimate e has
-order 3 and stays small for components that decay at once.
+The stages are collocation at the Radau nodes c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1). The error estimate e
+has order 3 and stays small for components that decay within one step.
 """
 
 from typing import ClassVar
@@ -31,15 +31,15 @@ _ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1
 
 
 class RadauIIA(ImplicitMethod):
-    """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff
-    springs, dampers and drives.
+    """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff springs, dampers and
+    drives.
 
-    L-stable: fast decaying modes do not limit the steps. The equations of a step are solved to round-off
-    by Newton's method, and differentiated through the implicit function theorem; if that fails, the step
-    is repeated at a fifth of its length. A step costs some fifty evaluations and a linear system three
-    times the size of the state. This pays if stability would force an explicit method to take many more
-    steps than accuracy requires. With `retry=True`, `simulate` uses this method if its default solver runs
-    out of steps on a stiff motion.
+    The method is L-stable: fast decaying modes do not limit the steps. Newton's method solves the equations
+    of a step to round-off, and the implicit function theorem differentiates them. If Newton's method fails,
+    the step is repeated at a fifth of its length. A step costs some fifty evaluations of the rates and a
+    linear system three times the size of the state. This is worthwhile if stability would force an explicit
+    method to take many more steps than accuracy requires. With `retry=True`, `simulate` uses this method if
+    its default solver runs out of steps on a stiff motion.
 
     Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and
     equations (IV.8.17) to (IV.8.19).
@@ -48,8 +48,8 @@ class RadauIIA(ImplicitMethod):
     order: ClassVar[int] = 4  # of the embedded estimate
 
     def solve(self, args: tuple, t, y: PyTree, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s), with an infinite error if its
-        equations were not solved. `args`: as in `integrands.py`.
+        """Return the change of the state `y` at `t` in a step `h` (s). The error is infinite if the equations
+        were not solved. `args`: as in `integrands.py`.
         """
         x0, unravel = ravel_pytree(y)
         h = jnp.asarray(h, x0.dtype)
@@ -61,7 +61,7 @@ class RadauIIA(ImplicitMethod):
 
         def equations(z):
             z = z.reshape(3, n)
-            # a loop compiles the rates once
+            # in a loop, so that the rates are compiled once
             slopes = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))
             return (z - h * A @ slopes).reshape(-1)
 

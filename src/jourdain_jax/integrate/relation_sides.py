@@ -1,4 +1,4 @@
-"""Sides of relations (`lowering/sides.py`) at a start, and when a number leaves zero."""
+"""Determine the sides of relations (`lowering/sides.py`) at the start, and when a number leaves zero."""
 
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_row
@@ -8,8 +8,8 @@ from jourdain_jax.integrate.loop.transitions import slowest
 def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
     """Set the sides of relations at the start of a motion, in lanes that have not yet tried a step.
 
-    A number that is zero (or an integer) gets the side that it has after the time d =
-    eps^(1/4) span, by the midpoint rule.
+    A number that is zero, or an integer for `floor` and `ceil`, gets the side on which it is after the time
+    d = eps^(1/4) span, by the midpoint rule.
     """
     if not form.sides:
         return
@@ -40,7 +40,7 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
         for k, (row, whole) in enumerate(zip(rows, form.sides, strict=True), first):
             x, later = w.load(values, k), w.load(ahead, k)
             off = x - w.intrinsic("floor", x + 0.5) if whole else x
-            # round-off relative to its change
+            # `x` is round-off relative to its change
             x = w.where(w.magnitude(off) <= w.eps**0.35 * w.magnitude(later - x), later, x)
             side = w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0))
             side = w.where(w.equal(x, x), 2.0 * w.intrinsic("floor", x) + 1.0, 0.0) if whole else side
@@ -50,8 +50,8 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
 
 
 def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> list[list[Number]]:
-    """Return values and rates of events. The value of a relation at rest is the distance to the threshold at
-    which its number leaves zero.
+    """Return the values and rates of events. For a relation whose number rests at zero, the value is the
+    distance to the threshold at which the number leaves zero.
     """
     c, rate = (list(part) for part in found)
     sides = p.every("mode")[form.modes :]
@@ -66,10 +66,8 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
 
 
 def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
-    """Return which values fall after an event, and the values. Values still rising from
-    zero do not count as falling.
-
-    The next saved time may be within round-off of the event.
+    """Return which values fall after an event, and the values. Values that still rise from zero do not count
+    as falling: the step may be very short, because a saved time may lie within round-off of the event.
     """
     rising = [~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
     c_1 = [w.where(rises & ~(b > 0.0), 1.0, b) for b, rises in zip(c_1, rising, strict=True)]

@@ -1,4 +1,4 @@
-"""Result codes of motions: one per sample, instead of exceptions.
+"""Result codes of motions. Each motion, also of a batch, has a result code instead of raising an exception.
 
 Codes up to `EVENT` mark motions that reached the end of their span or an event; all others failed.
 """
@@ -69,13 +69,13 @@ MESSAGES = {
         "failed, too; replace a stiff spring or damper by a constraint, or loosen the tolerances"
     ),
     OFF_CONSTRAINTS: (
-        "a step of constant length left the constraints so far that the projection undid more "
-        "than half of it, or a diffrax solver left them by more than its step errors explain; use shorter "
+        "a fixed step left the constraints so far that the projection reversed more than half "
+        "of it, or a diffrax solver left them by more than its step errors explain; use shorter "
         "steps or the default solver, or look for constraints that lose rank"
     ),
     BAD_TIMES: (
         "saved times lie outside the span or are not in order, the span is empty or not finite, or "
-        "time runs backwards despite friction; pass increasing `ts` between `t0` and `t1`"
+        "time runs backward despite friction; pass increasing `ts` between `t0` and `t1`"
     ),
     ENERGY_LOST: (
         "the energy, which should be constant, changed by more than the tolerances explain: the "
@@ -86,16 +86,16 @@ MESSAGES = {
         "redundant velocity constraints contradict each other at some saved time; omit one, "
         "or correct the inputs and times that determine them"
     ),
-    PROCESS_DIED: "processes died on it repeatedly, and a study of an earlier version skipped it",
+    PROCESS_DIED: "skipped by an earlier version, because its processes died repeatedly",
     UNRESOLVED: (
         "the step size shrank to zero, and `rtol` is below the resolution of this precision, 1.2e-7 "
         "in float32 and 2.2e-16 in float64: loosen it to 1e-5 and 1e-13, or set "
         "jax.config.update('jax_enable_x64', True)"
     ),
     TOO_MANY_TRANSITIONS: (
-        "more than `max_transitions` events at which the motion continues, or events "
-        "within round-off of each other, like the last bounces of a ball: switch to a mode in which it "
-        "rests, or raise `max_transitions`"
+        "more than `max_transitions` events after which the motion continues, or events "
+        "within round-off of each other, like the last bounces of a ball: switch to a mode of rest, "
+        "or raise `max_transitions`"
     ),
     IMPACT_GAINS_ENERGY: (
         "an impact would gain energy by Newton's restitution and Coulomb's law; use "
@@ -111,13 +111,13 @@ MESSAGES = {
         "impulse: use impact='moreau'"
     ),
     LIES_FLAT: (
-        "a disc or wheel with friction fell flat on its ground, where it does not touch in one point; "
-        "add contacts that can support it, or end the motion earlier by an event"
+        "a disc or wheel with friction fell flat on its ground, where it has no single contact point; "
+        "add contacts that can support it, or let an event end the motion earlier"
     ),
     STICKS: (
         "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a "
         "speed does at rest, so the motion cannot continue; use `friction=` of a contact or "
-        "`jj.joint_friction`, which hold at rest, or smooth the load, as by `jnp.tanh`"
+        "`jj.joint_friction`, which hold at rest, or smooth the load, as with `jnp.tanh`"
     ),
     UNSOLVED_STEP: (
         "the equations of an implicit step were not solved near the last time; use a shorter "
@@ -125,7 +125,7 @@ MESSAGES = {
     ),
 }
 
-# Retries with `retry=True` after a first failure; they add up in `Trajectory.fallback`.
+# Retries after a failure, with `retry=True`. `Trajectory.fallback` is their sum.
 AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",

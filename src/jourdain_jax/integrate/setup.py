@@ -1,8 +1,8 @@
 """Setup of a motion for an integrator, and the results of an integrator.
 
-Integrators use the time since the start, tau = t - t0, because a clock far from zero has few digits;
-time-independent scenes are then equally accurate at any t0. Rates, projection and events receive tau, the
-scene and its inputs t0 + tau.
+Integrators use the time since the start, tau = t - t0, because a time far from zero has few digits after the
+point. Scenes that do not depend on time are therefore equally accurate at any t0. Rates, projection and
+events receive tau; the scene and its inputs receive t0 + tau.
 """
 
 import abc
@@ -39,17 +39,17 @@ class Passed(eqx.Module):
     def times(
         self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
     ) -> Float[Array, "transitions"]:
-        """Return the times of transitions, rounded consistently with the saved times. `goals` are the saved
-        times `ts` measured from the start; a transition before a goal must also precede its saved time.
+        """Return the times of transitions, rounded consistently with the saved times `ts`.
 
-        Adding the `origin` to a time since the start may round it onto the wrong side.
+        `goals`: the saved times measured from the start. A transition before a goal must also precede its
+        saved time, but adding the `origin` may round it to the wrong side.
         """
         if not len(self.ts):
             return jnp.asarray(self.ts)
         found = origin + self.ts
         known = jax.lax.stop_gradient((ts, origin + goals, self.ts, goals, found))
         ts, also, tau, goals, now = (direction * x for x in known)
-        number = jnp.searchsorted(goals, tau)  # number of saved states before it
+        number = jnp.searchsorted(goals, tau)  # number of saved states before each transition
         least = jnp.append(-jnp.inf, jnp.nextafter(jnp.maximum(ts, also), jnp.inf))[number]
         most = jnp.append(jnp.minimum(ts, also), jnp.inf)[number]
         return found + direction * (jnp.clip(now, least, most) - now)
@@ -61,7 +61,7 @@ NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((
 class Solved(eqx.Module):
     """Result of an integrator."""
 
-    ts: Float[Array, "times *lanes"]  # since the start, like t_end
+    ts: Float[Array, "times *lanes"]  # measured from the start, like t_end
     ys: PyTree
     reached: Bool[Array, "times *lanes"]
     t_end: PerLane
@@ -71,17 +71,17 @@ class Solved(eqx.Module):
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     last_step: PerLane  # s, proposed by step-size control for the next step; NaN if unknown
-    # smallest pivot magnitude over all steps, negative after a change of sign; infinite if none was monitored
+    # smallest magnitude of pivots over all steps, negative after a change of sign; infinite if not monitored
     pivot: PerLane
     crossings: Int[Array, "*lanes"]  # as in `Trajectory`
     passed: Passed
 
 
 class Integrator(abc.ABC):
-    """Integrator of a motion: this package's steps (`integrate/own_steps.py`) or diffrax
+    """Integrator of a motion: this package's loop (`integrate/own_steps.py`) or diffrax
     (`motion/diffrax_steps.py`).
 
-    Numbers that change with every call are in the `Setup`.
+    It has static settings only; numbers that change with each call are in the `Setup`.
     """
 
     max_steps: int
@@ -104,8 +104,8 @@ class Integrator(abc.ABC):
 
     def lanes_solved(self, setups: "Setup", begun: "Begun") -> Solved:
         """Return the motions of a batch; all arrays have a leading batch axis."""
-        # hide times shared by all samples from XLA, which otherwise propagates them through diffrax's
-        # `nextafter` one operation per pass
+        # hide the times that all samples share from XLA, which would otherwise propagate them through
+        # diffrax's `nextafter`, one operation per pass
         times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0))
         timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, times)
         return eqx.filter_vmap(self.solved)(timed, begun)
@@ -121,7 +121,7 @@ class Times(NamedTuple):
     longest: Float[Entries, "*lanes"] | float
 
     def fitting(self, timely: "Flag | np.bool_") -> "Times":
-        """Return times that any loop accepts: round-off puts none beyond the end, and a short span replaces
+        """Return times that any loop accepts: clipped to the span, against round-off. A short span replaces
         inconsistent times.
         """
         ts, t0, t1 = self[:3]
@@ -129,7 +129,7 @@ class Times(NamedTuple):
             return self._replace(ts=jax.lax.clamp(jnp.minimum(t0, t1), ts, jnp.maximum(t0, t1)))
         direction = jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        # 1e-9 s, for motions that are not requested
+        # a span of 1e-9 s, for motions whose result is not used
         short = Times(np.linspace(0.0, 1e-9, len(ts)), 0.0, 1e-9, 1e-10, 1e-9)
         return Times(*(jnp.where(timely, x, y) for x, y in zip(self._replace(ts=inside), short, strict=True)))
 
@@ -140,7 +140,7 @@ class Times(NamedTuple):
 
 
 class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes 50 us
-    """Motion to be integrated; in a batch all arrays have a leading batch axis."""
+    """Motion to be integrated. In a batch, all arrays have a leading batch axis."""
 
     scene: Scene
     start: State
@@ -154,9 +154,9 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     longest: Float[Entries, "*lanes"] | float  # longest step, s
     integrator: Integrator
     usual: Usual | None  # typical sizes for projecting the start; None if it is on its constraints
-    judged: bool  # whether probing has already checked these parameters, at many states
-    fits: bool = False  # whether concrete times are known to be consistent
-    reference: Reference | None = None  # of a model: programs are shared by models with equal decisions
+    judged: bool  # whether probing has already checked these parameters at many states
+    fits: bool = False  # whether times are concrete and known to be consistent
+    reference: Reference | None = None  # of a model; models with equal decisions share programs
 
     @property
     def timely(self) -> "Flag | np.bool_":
@@ -165,7 +165,7 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
             return np.True_
         (ts, t0, t1), eps = self.times[:3], float(eps_of(self.ts))
         in_order = jnp.all((ts[1:] - ts[:-1]) * jnp.sign(t1 - t0) > 0)
-        # slip, impact and rest cannot be reversed in time
+        # motions with slip, impact or rest cannot be reversed in time
         forwards = (t1 > t0) | (not self.scene.switching.contacts)
         return ends_fit(ts[0], ts[-1], t0, t1, eps) & in_order & forwards
 
@@ -198,19 +198,19 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
 
     @property
     def knots(self) -> Float[Array, "knots"] | None:
-        """Return the sample times of inputs at which steps must end, measured from the start."""
+        """Return the sample times at which steps must end, measured from the start."""
         return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 
 
 class Plain(NamedTuple):
-    """Numbers of a motion as given: without derivatives, without batch axis if all samples share them."""
+    """Numbers of a motion without derivatives. Those that all samples share have no batch axis."""
 
     times: Times
     args: tuple  # as in `Begun`, without the vector field and the scene
 
 
 class Begun(eqx.Module):
-    """Start of the integration, marked for the adjoint."""
+    """Start of the integration."""
 
     right: Flag  # whether parameters, masses and inertias are valid
     timely: Flag | np.bool_  # whether the times are consistent
@@ -222,7 +222,7 @@ class Begun(eqx.Module):
 
 def ends_fit(first, last, t0, t1, eps: float) -> "Flag | bool":
     """Return whether the span is finite and not empty, and encloses the first and the last saved time in its
-    direction; for floats and for traced times.
+    direction. Times may be floats or traced.
     """
     direction, span = (t1 > t0) * 2.0 - 1.0, abs(t1 - t0)
     fits = (span > 0) & (span < np.inf) & ((last - first) * direction >= 0)

@@ -1,4 +1,4 @@
-"""States on the constraints: projection of a start, a search from other guesses, contradictory values.
+"""Project a start onto the constraints, search from other guesses, and detect contradictory values.
 
     g(t, q) = 0,   phi(t, q, u) = 0
 
@@ -39,7 +39,7 @@ OFF = 1e4  # a residual above this many eps is more than round-off
 
 
 class State(Printed, eqx.Module):
-    """State on the constraints, and its distance from the guess; `state["yaw"]`, `print(state)`.
+    """State on the constraints, and its distance from the guess: `state["yaw"]`, `print(state)`.
 
     q and u are in the units of the scene's coordinates and speeds (SI, rad).
     """
@@ -51,8 +51,8 @@ class State(Printed, eqx.Module):
     moved_u: Scalar  # largest change of a speed by the projection
     residual: Scalar  # remaining residual of constraints and quaternion norms
     names: tuple[Names, Names] = static()
-    # index of the successful guess: 0, the given values; then others (`start`). A float, so that losses can
-    # be differentiated with respect to a whole state
+    # index of the successful guess: 0 for the given values, higher for others (`start`). A float, so that
+    # losses can be differentiated with respect to a whole state
     guess: Scalar = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
     def __getitem__(self, name: str):
@@ -78,8 +78,8 @@ class State(Printed, eqx.Module):
         )
         if int(self.guess):
             moved += (
-                f"; from guess {int(self.guess)}: omitted coordinates start elsewhere in the domain, because"
-                " the reference led to no solution"
+                f"; from guess {int(self.guess)}: the search for omitted coordinates failed and began again"
+                " elsewhere in the domain"
             )
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
@@ -97,7 +97,7 @@ class Guess(NamedTuple):
     u: Float[Entries, "speeds"]
     free_q: Bool[Entries, "coordinates"]
     free_u: Bool[Entries, "speeds"]
-    bounded: Bool[Entries, "coordinates"]  # whether it must end inside the scene's stated domain
+    bounded: Bool[Entries, "coordinates"]  # whether a coordinate must end inside the scene's domain
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
@@ -107,7 +107,7 @@ class Guess(NamedTuple):
 
 
 def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
-    """Return which of these entries are not held."""
+    """Return a mask of the names that are not held."""
     return np.array([name not in held for name in names], bool)
 
 
@@ -120,8 +120,8 @@ def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
 
 
 def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Flag]:
-    """Project the start onto the constraints; also return whether the position solve converged within the
-    domain. Without `guesses` there is no search.
+    """Project the start onto the constraints. Also return whether the projection of the coordinates converged
+    within the domain. If it did not, search from `guesses`, if any.
 
     The residual is infinite if a number is not finite or a coordinate is out of its permitted range.
     """
@@ -141,7 +141,7 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
 
 def _put_coordinates(scene: Scene, t, q, start: Guess, guesses) -> tuple[Array, Array, Count, Flag]:
-    """Return the nearest coordinates, the residual, the number of the guess, and whether q led to them."""
+    """Return the nearest coordinates, the residual, the index of the guess, and whether q converged."""
     free, usual = jnp.asarray(start.free_q), start.usual
     here, at, begin = stopped((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
@@ -156,16 +156,16 @@ def _put_coordinates(scene: Scene, t, q, start: Guess, guesses) -> tuple[Array, 
         better = ~arrived & (left_of(other.g) <= left_of(g))
         found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
         q = jnp.where(better & free, found.begin, q)
-    # derivatives of Newton's method from its starting point; without a solution they would diverge
+    # add the derivatives of Newton's method from its starting point; without a solution they would diverge
     near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
     return jnp.where(found.met, near_q, q), g, found.guess, arrived
 
 
 def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordinates"]:
-    """Return coordinates of the states `elsewhere`, projected onto the geometric constraints; NaN
-    without a solution in the domain.
+    """Return the coordinates of the states `elsewhere`, projected onto the geometric constraints. Those
+    without a solution in the domain are NaN.
 
-    `native`: whether machine code may project them.
+    `native`: machine code may project them.
     """
     t, q, u = jax.tree.map(lambda x: jnp.asarray(x, real_type()), elsewhere(scene))
     if not names_of_position_rows(scene):
@@ -178,28 +178,28 @@ def coordinates_elsewhere(scene: Scene, native: bool) -> Float[Array, "3 coordin
         near_q, g = put_positions(here, t, q, every, usual)
         return jnp.where(_arrived(q, near_q, g, Guess(q, u[0], every, every, every, usual)), near_q, jnp.nan)
 
-    return jax.lax.map(put, (t, q))  # constraints may be callbacks without batching
+    return jax.lax.map(put, (t, q))  # constraints may be callbacks that cannot be batched
 
 
 @eval_numpy
 def known_faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return for each fault whether a concrete scene has it, at this state or elsewhere."""
+    """Return for each possible fault whether a concrete scene has it, at this state or elsewhere."""
     return faults_at(scene, t, q, u, inputs, coordinates_elsewhere(scene, False))
 
 
 def left_of(g: Float[Array, "closures"]) -> Scalar:
-    """Return the largest significant residual of the geometric constraints. NaN counts as
-    infinite, round-off as zero.
+    """Return the largest residual of the geometric constraints. NaN counts as infinite, a residual too small
+    for a contradiction as zero.
     """
     left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
     return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
 def _arrived(q, near_q, g, start: Guess) -> Flag:
-    """Return whether the constraints are satisfied, with coordinates in their
-    permitted range and near the guess.
+    """Return whether the coordinates satisfy the constraints, are in their permitted range, and are near the
+    guess.
     """
-    # moving a coordinate by more than ten widths of the domain counts as divergence; NaN counts as far
+    # a change by more than ten widths of the domain, or NaN, counts as divergence
     close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
     return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
 
@@ -215,7 +215,7 @@ class _Put(NamedTuple):
 
 
 def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
-    """Return the solution from the first successful guess. The first guess is q itself."""
+    """Return the solution from the first successful guess, beginning with q itself."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
@@ -225,7 +225,7 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
     low, high = (
         jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1))
     )
-    # coordinates on which no constraint depends stay
+    # coordinates on which no constraint depends keep the value of q
     every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(eps_of(q))
@@ -238,10 +238,10 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
 
 
 def contradiction(dtype) -> float:
-    """Return the residual (m, rad) above which given values count as contradictory. It allows for numbers
-    with few digits, and for round-off.
+    """Return the residual (m, rad) above which given values count as contradictory. It allows for values with
+    few digits, and for round-off.
     """
-    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: for numbers with few digits
+    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # 1.5e-5: for values with few digits
 
 
 def may_contradict(
@@ -250,14 +250,14 @@ def may_contradict(
     free_q: Bool[np.ndarray, "coordinates"],
     free_u: Bool[np.ndarray, "speeds"],
 ) -> bool:
-    """Return whether held values (entries that are not free) may contradict each other.
-    `known`: structure of the scene.
+    """Return whether held values (entries that are not free) may contradict each other. `known`: structure of
+    the scene. If
 
         rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: columns of the free variables
 
-    If both equations hold, values contradict each other at most at isolated configurations.
+    values can contradict each other only at isolated configurations.
     """
-    # otherwise the constraints determine the dependent ones
+    # if all dependent speeds are free, the constraints determine them
     of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))
     of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
     if of_speeds and not known.affine:

@@ -1,9 +1,9 @@
-"""Likely mistakes of a scene, in one table: computable, but hardly intended.
+"""Check a scene for likely mistakes: things that can be computed but are hardly intended.
 
-smoothness        jumps and kinks of poses, constraints and coordinate rates on lines through the domain
-grounds           behaviour of contact grounds against their description
+smoothness        jumps and kinks of poses, constraints and coordinate rates along lines through the domain
+grounds           contact grounds that behave differently from their description
 bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all conditions checked at the start of a motion
-scalar program    rates and slopes of the program against JAX's
+scalar program    rates and derivatives of the program, compared with JAX's
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from jourdain_jax.structure.structure import structure_whatever_its_faults
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on likely mistakes. `print` shows a table."""
+    """Findings of `check`: likely mistakes in words, by subject. `print` shows a table."""
 
     scene: str
     found: dict[str, tuple[str, ...]]
@@ -40,22 +40,22 @@ class Checked(Printed):
 @shown_from_users_lines
 @of_known_numbers
 def check(scene: Scene | BuiltFor) -> Checked:
-    """Check a scene for likely mistakes: kinks and jumps, grounds carried by other bodies, impossible bodies,
-    a program that differs from JAX.
+    """Check a scene for likely mistakes: kinks and jumps, grounds carried by other bodies, bodies with
+    impossible inertia, a scalar program that differs from JAX.
 
         print(jj.check(scene))
 
-    It examines some states of the domain and may miss a narrow feature between them. `verify` prints
-    the table, and the first `build` of a class warns with it. Building or moving the scene raises the
-    first finding as an error. Exceptions are a program that differs (dense matrices replace it) and a
-    moment of inertia above the sum of the others. Raises ValueError without an admissible state, or if
-    a free motion has no inertia.
+    The check samples states of the domain, so it may miss a narrow feature between them. `verify` also
+    prints this table, and the first `build` of a class issues it as a warning. Building or moving the scene
+    raises the first finding as an error, with two exceptions: a program that differs (dense matrices replace
+    it), and a moment of inertia above the sum of the two others. Raises ValueError if there is no admissible
+    state, or if a free motion has no inertia.
     """
     return _checked(as_scene(scene), None)
 
 
 def _checked(scene: Scene, every_speed: bool | None) -> Checked:
-    """Return the table, with the program for one state (as for `lowered`)."""
+    """Return the findings; `every_speed` selects the program to compare, as in `lowered`."""
     known = structure_whatever_its_faults(scene)
     program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene, every_speed)
     found = {
@@ -71,6 +71,6 @@ def _checked(scene: Scene, every_speed: bool | None) -> Checked:
 
 @once_per_class
 def warn_of_mistakes(scene: Scene, every_speed: bool) -> None:
-    """Warn with the table if there are findings, once per class and state."""
+    """Issue the table as a warning if there are findings, once per class and state."""
     if not (found := _checked(scene, every_speed)).passed:
         warn(str(found))

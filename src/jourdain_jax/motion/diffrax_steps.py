@@ -1,10 +1,11 @@
-"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates, with its step-size control, events and
-adjoints (`ForwardMode`, `RecursiveCheckpointAdjoint`).
+"""Integration by `diffrax.diffeqsolve`, with diffrax's step-size control, events and adjoints (`ForwardMode`,
+`RecursiveCheckpointAdjoint`).
 
 Steps end at the saved times (`step_ts`) and at sample times of the inputs (`jump_ts`), and are no longer than
-`max_step` (`dtmax`). States are projected onto the constraints only where they are saved; a deviation larger
-than step errors explain gives a result code. A stop event counts only if its value is negative at the end of
-a step, and is then located by dense output. A value that falls and rises again within a step is missed.
+`max_step` (`dtmax`). Only saved states are projected onto the constraints. If a projection moves the state
+further than step errors can explain, the motion gets a result code. A stop event is detected only if its
+value is negative at the end of a step; dense output then locates it. A value that falls and rises again
+within one step is missed.
 """
 
 from functools import partial
@@ -49,12 +50,12 @@ class _Rates(eqx.Module):
 
 @shown_from_users_lines
 def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
-    """Return the rates of a scene for `diffrax.diffeqsolve`, with the state (q,
-    u): coordinates and all speeds.
+    """Return the rates of a scene as a term for `diffrax.diffeqsolve`. Its state is (q, u): coordinates and
+    all speeds.
 
-    Use it for features of diffrax that `simulate` lacks: step-size control, saving, adjoints and events. Only
-    accelerations keep the state on the constraints; `jj.consistent` projects states back onto them. `inputs`:
-    as for `simulate`. Differentiable in the scene and its inputs.
+    Use it for features of diffrax that `simulate` lacks: step-size control, saving, adjoints and events. The
+    constraints are enforced only through the accelerations, so the state drifts; `jj.consistent` projects it
+    back onto them. `inputs`: as for `simulate`. Differentiable in the scene and its inputs.
 
     **Examples**
 
@@ -119,7 +120,7 @@ class Diffrax(eqx.Module, Integrator):
         control = diffrax.ClipStepSizeController(
             control, step_ts=ts, jump_ts=None if knots is None else knots
         )
-        # `flip` states that values fall; without it, samples without an event would raise an error
+        # `flip`: event values fall; without it, samples that meet no event would raise an error
         search = optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0), flip=True)
         event = diffrax.Event(_lowest, search, direction=False)
         solution = diffrax.diffeqsolve(
@@ -199,8 +200,8 @@ def check(setup: Setup) -> None:
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
-    """Return which events have happened at the start, by values there and after two short steps (midpoint
-    rule). diffrax does not check the start.
+    """Return which events occur at the start, from their values there and after two short midpoint steps.
+    diffrax itself does not check the start.
     """
 
     def moved(h):
@@ -222,8 +223,8 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):
-    """Return the lowest value of all stop events. With several events in one step, diffrax would report the
-    first in the list, not in time.
+    """Return the lowest value of all stop events, as a single event. Of several events in one step, diffrax
+    would report the first in the list, not the earliest.
     """
-    direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
+    direction = terms.contr(0.0, 1.0)  # in diffrax, time increases also in a backward motion
     return jnp.min(integrands.events(t * direction, y, args))

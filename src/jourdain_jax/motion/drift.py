@@ -1,11 +1,12 @@
-"""Drift of energy and constraints along a motion. It sets result codes, also inside `jit` and for each sample
-of a batch.
+"""Detect drift of energy and constraints along a motion. Drift sets a result code, also inside `jit` and for
+each sample of a batch.
 
 *Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about
-`atol + rtol |y|` per step in each number y of the state. If errors of this size in all numbers change the
-energy by dE, N steps change it by about N dE, and round-off by about N eps of it. Over all models, at
-tolerances from 1e-4 to 1e-11, no drift exceeded half of N dE. A drift of ten times N dE and at least 1 % of
-the varying energy therefore means an error, such as an unnoticed singular position.
+`atol + rtol |y|` per step in each entry y of the state. If errors of this size in all entries change the
+energy by dE, then N steps change it by about N dE, and round-off changes it by about N eps of its value. Over
+all models, at tolerances from 1e-4 to 1e-11, no drift exceeded half of N dE. A drift of more than ten times
+N dE and more than 1 % of the varying energy therefore indicates an error, such as an undetected singular
+position.
 
 *Constraints.* Redundant constraints that the start satisfies may contradict each other later, unless
 phi_0 = 0:
@@ -32,7 +33,7 @@ from jourdain_jax.motion.trajectories import diagnostics
 
 
 def step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
-    """Return the distance by which a projection moved a state from `free` to `y`, in tolerances of a step."""
+    """Return how far a projection moved a state from `free` to `y`, in units of the step tolerance."""
     rtol, atol = setup.tolerances
     parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
     return jnp.max(
@@ -40,7 +41,7 @@ def step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
     )
 
 
-MOST_STEP_ERRORS = 10  # times the change from N steps at their tolerance
+MOST_STEP_ERRORS = 10  # largest drift, as a multiple of the errors of N steps at the tolerance
 
 
 def conserves(setup: Setup) -> bool:
@@ -62,8 +63,9 @@ def energies_near(
     states: tuple[Float[Array, "times"], Float[Array, "times rows"], Float[Array, "times inputs"]],
     of_rows: Callable[[Array], Integrated],
 ) -> tuple[Float[Array, "times 2"], Float[Array, "times 2"]]:
-    """Return T and V (J) at states, and again with each coordinate and speed increased by the possible error
-    of a step. A state: time, rows (for `of_rows`) and inputs.
+    """Return T and V (J) at the states, and again with each coordinate and speed increased by its tolerance.
+
+    `states`: times, state vectors, inputs; `of_rows` unpacks a state vector.
     """
     field, fixed = setup.field, args[3]
 
@@ -75,15 +77,15 @@ def energies_near(
         both = jnp.stack([rows, off(jnp.where, jnp.abs, rows, *setup.tolerances)])
         return jax.lax.map(lambda rows: field.energies(here._replace(y=of_rows(rows))), both)
 
-    # loads of dense matrices may be callbacks without batching
+    # loads in dense matrices may be callbacks that cannot be batched
     states = stopped(states)
     found = jax.lax.map(at, states) if field.lowered is None else jax.vmap(at)(states)
     return found[:, 0], found[:, 1]
 
 
 def energy_lost(at: Float[Array, "times 2"], near: Float[Array, "times 2"], steps) -> Flag:
-    """Return whether T + V changed by more than the errors of N `steps` explain; `at`, `near`: from
-    `energies_near`.
+    """Return whether T + V changed by more than the errors of `steps` steps can explain. `at`, `near`: the
+    two results of `energies_near`.
     """
     error = jnp.sum(jnp.abs(near - at) + eps_of(at) * jnp.abs(at), axis=1, keepdims=True)
     numbers = jnp.concatenate([at, jnp.sum(at, axis=1, keepdims=True)], axis=1)  # T, V, T + V
@@ -100,9 +102,9 @@ def rows_violated(
     q: Float[Array, "times coordinates"],
     u: Float[Array, "times speeds"],
 ) -> Flag:
-    """Return whether some constraint is violated at some of these states, ignoring unreached ones (NaN).
+    """Return whether any constraint is violated at any of these states. Unreached states (NaN) are ignored.
 
-    |phi| > 1 % of max over time of (|phi - A u| + |A| |u|)
+    violated: |phi| > 1 % of the maximum over time of (|phi - A u| + |A| |u|)
     """
     scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
 
@@ -110,6 +112,6 @@ def rows_violated(
         phi, A = linearised_rows(scene, *state, inputs(state[0]))
         return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
 
-    left, size = jax.lax.map(left_and_size, states)  # constraints may be callbacks without batching
-    # 1 % is far more than steps at loose tolerances leave
+    left, size = jax.lax.map(left_and_size, states)  # constraints may be callbacks that cannot be batched
+    # 1 % is far above the residual that steps at loose tolerances leave
     return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

@@ -20,7 +20,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Freedoms:
-    """Independent speeds, and how well they determine the others."""
+    """Independent speeds, and how well they determine the dependent ones."""
 
     privileged: Labels
     dependent: Labels
@@ -49,5 +49,5 @@ class Conserved:
     """Conserved quantities of a motion."""
 
     energy: bool  # sum of kinetic and potential energy; then no work is integrated
-    ignorable: Labels  # coordinates without influence on accelerations; empty without a scalar program
+    ignorable: Labels  # coordinates that do not affect accelerations; empty if there is no scalar program
     invariants: Labels  # as the scene states them

@@ -1,4 +1,4 @@
-"""Choice of the vector field of a model: its state, scalar program or dense matrices, and reduction."""
+"""Choose the vector field of a model: the state, scalar program or dense matrices, and the reduction."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 def vector_field_of(
     scene: Scene, formulation: Formulation, backend: str, constant: bool, work: bool
 ) -> VectorField:
-    """Return the vector field for `constant` or other inputs, with or without `work`."""
+    """Return the vector field. `constant`: inputs are constant; `work`: integrate the work of loads."""
     structure, state, reduction = structure_of(scene), formulation.state, formulation.reduction
     _check(scene, structure, state, backend)
     minimal = state == "minimal" or (
@@ -74,7 +74,7 @@ def vector_field_of(
         return MinimalByMatrices(**common, rows=structure.kept_rows)
     loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
     branches = cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank
-    # how uncertain usual sizes are; nonlinear constraints may be a thousand times larger
+    # uncertainty of typical sizes: nonlinear constraints may be a thousand times larger
     known = 1.0 if structure.affine else trust(scene)
     return FullByMatrices(**common, undecided=undecided(real_type()) / known if branches else None)
 
@@ -82,7 +82,9 @@ def vector_field_of(
 def _program(
     scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str
 ) -> Lowered | None:
-    """Return the scalar program, or None for dense matrices; ValueError if the backend requires a program."""
+    """Return the scalar program, or None for dense matrices. Raises ValueError if the backend needs a program
+    and there is none.
+    """
     reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
         reason = "its own reduction or stabilisation requires dense matrices"
@@ -116,15 +118,15 @@ def _check(scene: Scene, structure: Structure, state, backend) -> None:
 
 
 def _cutoff(structure: Structure) -> float | None:
-    """Return a wider cutoff if usually well-conditioned constraints lose rank; None: round-off."""
+    """Return a wider rank cutoff if the constraints are typically well conditioned; None: round-off."""
     return passing_cutoff(real_type()) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
 def _default_reduction(
     structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None
 ) -> Reduction:
-    """Return the default reduction: independent speeds for the minimal state; for the full state the
-    reduction of the lowered program, or else the null space by QR.
+    """Return the default reduction: independent speeds for the minimal state; for the full state, the
+    reduction of the scalar program, or the null space by QR if there is no program.
     """
     if independent is not None:
         return Privileged(independent)

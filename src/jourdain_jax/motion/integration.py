@@ -1,8 +1,8 @@
-"""One motion from start to end as one compiled program, by this package's loop over steps or by diffrax.
+"""Compute one motion from start to end in one compiled program.
 
-Both return the states at the saved times, which of them were reached, and where and why the motion ended.
-Speeds are then computed, and everything is returned as a `Trajectory`.
-Drift of energy and constraints sets further result codes (`drift.py`).
+The integrator, this package's loop over steps or diffrax, returns the states at the saved times, which times
+were reached, and where and why the motion ended. Dependent speeds are then computed, and all results are
+returned as a `Trajectory`. Drift of energy or constraints sets further result codes (`drift.py`).
 """
 
 from collections.abc import Callable
@@ -55,8 +55,8 @@ def _one_motion(setup: Setup) -> Trajectory:
 
 
 def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
-    """Return the setup in the modes of its contacts; the same with marks, for a loop over steps; the zero of
-    the marks; and the start.
+    """Return the setup in the modes of its contacts, the same setup marked by `_entered`, the zero of these
+    marks, and the start.
     """
     given = _in_contact(_with_machine_code(_prepared(setup)))
     timely, (setup, asked) = given.timely, _entered(given)
@@ -69,9 +69,9 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     return given, setup.at(times), asked, _begin(setup, timely, fixed, plain)
 
 
-# The options minimise compile time; steps in machine code are not affected. A first motion of a disc takes
-# 0.9 s of processor time instead of 1.8, of a bicycle 1.1 instead of 1.8. A motion with 201 saved times takes
-# 0.34 ms instead of 0.27 (bicycle: 2.10 instead of 2.05).
+# These options minimise XLA's compile time and do not affect steps in machine code. Processor time of a first
+# motion: 0.9 s instead of 1.8 (disc), 1.1 instead of 1.8 (bicycle). A motion with 201 saved times takes
+# 0.34 ms instead of 0.27 (disc), 2.10 instead of 2.05 (bicycle).
 _compiled = for_programs(_one_motion, lambda setup: None if setup.reason_against_machine_code else RUN_SELDOM)
 
 
@@ -81,12 +81,12 @@ def _numbers(setup: Setup) -> dict:
 
 
 def _prepared(setup: Setup) -> Setup:
-    """Return the setup with all numbers in the default precision; their derivatives keep their own type."""
+    """Return the setup with all numbers in the default precision. Derivatives keep the original types."""
     return setup._replace(**in_default_precision(_numbers(setup)))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup, with machine code for quantities at saved times if machine code integrates it."""
+    """Return the setup; if machine code integrates it, machine code also computes values at saved times."""
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram):
         return setup
@@ -94,11 +94,11 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
-    """Return the motions of a batch. A scalar program runs `own_steps.width` samples at a time;
-    otherwise they run under `vmap`.
+    """Return the motions of a batch. A scalar program advances `own_steps.width` samples at a time; other
+    setups run under `vmap`.
 
-    `lane`: the varying part of the setup. On a GPU constant numbers have no batch axis,
-    so kernels receive them once.
+    `lane`: makes the setup of one sample from its part of `varied`. On a GPU, constant numbers get no batch
+    axis, so that kernels receive them once.
     """
     setups = eqx.filter_vmap(lane)(*varied)
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
@@ -109,27 +109,27 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
 
 
 def _entered(setup: Setup) -> tuple[Setup, Scalar]:
-    """Return the setup and a zero by which `_finish` recognises whether a motion failed
-    (`calculus/markers.py`). Derivatives of the setup are zero if its motion is not
-    used, and NaN after a failure.
+    """Mark the numbers of a setup (`calculus/markers.py`). Return the marked setup, and the zero that
+    `_finish` passes to `left`. Derivatives of the setup are then zero if the motion is not used, and NaN if
+    it failed.
     """
     place = lambda s: (s.scene, s.start.q, s.start.u, s.inputs, s.t0, s.t1, s.ts)
     numbers, rest = eqx.partition(place(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
-    each, asked = entered(*lanes_first(leaves))  # also numbers that all motions share
+    each, asked = entered(*lanes_first(leaves))  # includes numbers that all motions share
     return eqx.tree_at(place, setup, eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
 def _plain(setup: Setup, timely: Flag | np.bool_) -> Plain:
-    """Return the numbers of a setup before `_entered`; numbers shared by all motions have no batch axis."""
+    """Return the numbers of a setup before `_entered` marks them. Shared numbers have no batch axis."""
     setup = stopped(setup)
     fixed = setup.field.fixed(setup.scene)
     return Plain(setup.times.fitting(timely), (None, None, setup.inputs, fixed, setup.t0))
 
 
 def _in_contact(setup: Setup) -> Setup:
-    """Return the setup with switching contacts in their modes at the start. Bodies that then touch the
-    ground are projected onto it.
+    """Return the setup with each switching contact in its mode at the start. Bodies that touch the ground are
+    projected onto it.
     """
     scene, t0, start = setup.scene, setup.t0, setup.start
     if not scene.switching.contacts:
@@ -190,7 +190,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         return found, pivot, state, step_errors(setup, free, y) if puts_back else None
 
     found, pivots, states, moved_by = jax.vmap(at_state)(ts, rows)
-    # negative if A_z was singular along the motion; NaN, which marks a lost end, is ignored
+    # negative if A_z was singular along the motion; NaN marks an unknown end state and is ignored
     pivot = jnp.minimum(1.0, solved.pivot)
     if pivots is not None:
         pivots = jnp.append(pivots * jnp.sign(pivots[0]), pivot)
@@ -210,10 +210,10 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     unwatched = reason_against_watching(setup)
     result = _result(setup, begun, solved, pivot, causes)
     failed = result > result_codes.EVENT
-    # a failure that no step detected happened at an unknown time
+    # the time of a failure is unknown if no step detected it
     over = (result == result_codes.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > result_codes.EVENT)
     noticed = over | (result == solved.code) | (result == result_codes.NOT_FINITE)
-    beyond = failed & ~(noticed & jnp.append(saved, False))  # of the saved states and of the end
+    beyond = failed & ~(noticed & jnp.append(saved, False))  # for the saved states and the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     t_end = t_end if begun.timely is np.True_ else jnp.where(begun.timely, t_end, given.t0)
@@ -255,7 +255,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
 def _phases(
     inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, names: tuple[str, ...], named: Modes
 ) -> Phases:
-    """Return the phases of a motion, which events at the times `ts` end; infinite after the last one."""
+    """Return the phases of a motion between the events at times `ts` (infinite after the last event)."""
     first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
     modes = passed.modes if len(passed.modes) == len(first) else np.zeros((len(first), 0))
     before = jnp.stack(first)[:, None] if first else jnp.zeros((0, 1))
@@ -269,8 +269,8 @@ def _phases(
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
-    """Check parameters, bodies, contacts and the start. A faulty sample gets a NaN
-    start, so that it ends at once.
+    """Check parameters, bodies, contacts and the start. Return whether all are valid, and the start: NaN for
+    an invalid sample, which then ends at once.
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
@@ -289,8 +289,8 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
 
 
 def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
-    """Return the result code, with the cause if known; earlier conditions take precedence. `of_drift`:
-    conditions of motions that reached their end, with their codes.
+    """Return the result code: that of the first condition that holds, otherwise the integrator's. `of_drift`:
+    further conditions for motions that reached their end, with their codes.
     """
     start, end, code = begun.start, solved.y_end, solved.code
     eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
@@ -301,14 +301,15 @@ def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tu
         *([] if begun.timely is np.True_ else [(~begun.timely, result_codes.BAD_TIMES)]),
         (~finite(start.q, start.u), result_codes.BAD_START),
         (~(start.residual <= 1e3 * np.sqrt(eps)), result_codes.INCONSISTENT_START),
-        # a pivot that changed sign or is this small: independent speeds no longer determine the others
+        # if a pivot changed sign or is this small, the independent speeds no longer determine the others
         *([(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION)] if setup.field.needs_pivot else []),
         (~finite(end.q, end.v), result_codes.NOT_FINITE),
         (short & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED),
-        # if no step succeeds, however short, the accelerations themselves are at fault
+        # if no step succeeds, however short, the accelerations themselves are wrong
         (short & (solved.accepted == 0), result_codes.NOT_FINITE),
         *((arrived & is_so, cause) for is_so, cause in of_drift),
     ]
-    # XLA repeats a chain of `where` in each derivative that is NaN after a failure, but not a reduction
+    # XLA would repeat a chain of `where` in each derivative that is NaN after a failure; a reduction it does
+    # not
     first = jax.lax.argmax(jnp.stack([*(is_so for is_so, _ in causes), jnp.array(True)]), 0, np.uint32)
     return jnp.append(np.array([cause for _, cause in causes], np.int32), code)[first]

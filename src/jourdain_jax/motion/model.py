@@ -1,4 +1,4 @@
-"""Models: scenes with the choices of `build`, which `simulate` and others accept instead of a scene."""
+"""Models: scenes with the choices made by `build`. `simulate` and other functions accept them as scenes."""
 
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
@@ -35,18 +35,18 @@ from jourdain_jax.structure.structure import Reference, Structure, structure_of,
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Model(BuiltFor, Printed):
-    """Scene with the choices for its integration, made by `build`. Prints as a table.
+    """Scene with the choices that `build` made for its integration. Prints as a table.
 
-    It is a pytree whose leaves are the parameters of `scene`. `model.replace(radius=r)` changes parameters
-    and keeps the state and the backend. If JAX traces `r`, the new model keeps all choices that depend on
-    numbers. A model is pickled as its scene and built again when loaded.
+    A model is a pytree whose leaves are the parameters of `scene`. `model.replace(radius=r)` changes
+    parameters and keeps the state and the backend. If JAX traces `r`, the new model also keeps all choices
+    that depend on parameter values. Pickling stores the scene; loading builds the model again.
     """
 
     scene: Scene
     formulation: Formulation  # with a decided state, if returned by `build`
     backend: str  # argument of `build`
-    decided: Reference | None  # scene whose numbers decided; None: this one, with class defaults if traced
-    memory: int | None = None  # bytes for batches of motions and for the records of reverse mode, if given
+    decided: Reference | None  # scene that the choices are based on; None: `scene`, class defaults if traced
+    memory: int | None = None  # limit in bytes for batches of motions and for the records of reverse mode
     made: Any = None  # vector fields and constraint sizes by case, cached by `modelled`
 
     def replace(self, **parameters) -> "Model":
@@ -55,12 +55,12 @@ class Model(BuiltFor, Printed):
 
     @property
     def reference(self) -> Reference:
-        """Return the scene whose numbers replace traced ones."""
+        """Return the scene whose parameter values replace traced ones."""
         return self.decided or Reference(self.scene)
 
     @property
     def standing_in(self) -> AbstractContextManager:
-        """Return a context in which the numbers used for decisions replace traced ones."""
+        """Return a context in which the parameters of `decided`, if any, replace traced ones."""
         return nullcontext() if self.decided is None else self.decided.stands_in()
 
     @property
@@ -69,18 +69,20 @@ class Model(BuiltFor, Printed):
         return structure_of(self.scene if self.decided is None else self.decided.scene)
 
     def field(self, constant: bool = True, work: bool = True) -> VectorField:
-        """Return the integrated vector field for `constant` or other inputs, with or without `work`."""
+        """Return the vector field. `constant`: inputs are constant; `work`: integrate the work of loads."""
         choice = self.scene, self.formulation, self.backend
         return self.once((constant, work), lambda: vector_field_of(*choice, constant, work))
 
     def usual(self, determined: bool) -> Usual:
-        """Return typical sizes for projections; `determined`: constraints determine the free speeds."""
+        """Return typical sizes for projections. `determined`: constraints determine the free speeds."""
 
         def sizes() -> Usual:
-            # its traces must not be evaluated at once
+            # outside `ensure_compile_time_eval`, which would evaluate the traces made here
             found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))
             with jax.ensure_compile_time_eval():
-                return jax.device_put(found)  # passing it on takes a fifth of the time of a NumPy array
+                return jax.device_put(
+                    found
+                )  # a JAX array is passed to programs five times faster than NumPy's
 
         return self.once(determined, sizes)
 
@@ -91,7 +93,7 @@ class Model(BuiltFor, Printed):
         return as_inputs(self.scene, given)
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the result of `make` for these parameters, computed once per case."""
+        """Return the result of `make`, computed once per case and parameter values."""
         if self.made is None:
             return modelled(self).once(case, make)
         if case not in self.made:
@@ -164,7 +166,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def way(self) -> str:
-        """Return the integrator for constant inputs, and why no faster one applies."""
+        """Return which backend integrates the scene with constant inputs, and why no faster one can."""
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as requested'}"
@@ -204,7 +206,8 @@ class Model(BuiltFor, Printed):
     def save(self, path: FilePath) -> None:
         """Write the results of `build` to the file `path`, for `jj.load_model`.
 
-        Raises ValueError for a model with its own reduction or stabilisation, or parts kept as JAX calls.
+        Raises ValueError for a model with its own reduction or stabilisation, or with parts that remain JAX
+        calls.
         """
         scene, formulation = self.reference.scene, self.formulation
         if formulation.reduction is not None or formulation.baumgarte is not None:
@@ -318,13 +321,13 @@ def build(
         motion = jj.simulate(model, {"lean": 0.3}, t1=5.0)
         slope = jax.grad(lambda r: jj.simulate(model.replace(radius=r), {"lean": 0.3}, t1=5.0).q_end[0])(0.5)
 
-    `formulation`, `backend`: as for `simulate`. `memory`: bytes, or a text such as "2GB": limit for the
+    `formulation`, `backend`: as for `simulate`. `memory`: a limit in bytes, or a text such as "2GB", for the
     chunks of a `rollout` and the records of reverse mode (default: 4 GiB) and, if given, for the processes of
-    a `Study`. All functions of a scene build on first use and cache the result. `start`, `simulate`,
+    a `Study`. Functions that take a scene build it on first use and cache the result. `start`, `simulate`,
     `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the
-    model instead of `scene`; for others use its `.scene`. The first call for a class warns with the findings
-    of `check`, if any. Raises ValueError as `structure_of` does (no admissible state, no inertia along a free
-    motion, impossible bodies), and if formulation or backend do not suit the scene.
+    model instead of `scene`; pass its `.scene` to others. The first call for a class warns of the findings of
+    `check`, if any. Raises ValueError if the scene has no admissible state, no inertia along a free motion or
+    impossible bodies, or if formulation or backend do not suit the scene.
     """
     scene = as_scene(scene)
     structure_of(scene)  # raises an error for an invalid scene
@@ -341,12 +344,13 @@ def build(
 
 
 def load_model(path: FilePath, scene: Scene) -> Model:
-    """Load the model of a scene from a file of `Model.save`, without tracing, probing or lowering.
+    """Load the model of a scene from the file `path` that `Model.save` wrote, without tracing, probing or
+    lowering.
 
         jj.build(bicycle).save("bicycle.model")
         model = jj.load_model("bicycle.model", bicycle)
 
-    `path`: file; `scene`: a scene of the same class, methods and parameter values. Loading executes no code,
+    `scene`: a scene with the class, methods and parameter values of the saved one. Loading executes no code,
     but the file determines the integrated equations, so load only files you trust. Raises ValueError if the
     file is damaged or belongs to another scene, version or precision.
     """
@@ -357,7 +361,9 @@ def load_model(path: FilePath, scene: Scene) -> Model:
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return a scene or model with this formulation and backend, and the choices cached for its values."""
+    """Return a model of the scene with this formulation and backend, and the choices cached for its parameter
+    values. A model keeps its own formulation and backend unless a formulation is given.
+    """
     decided = memory = None
     if isinstance(scene, Model):
         if formulation is None:

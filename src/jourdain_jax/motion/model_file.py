@@ -1,12 +1,12 @@
-"""Files of models: the findings of `build` as JSON, after a line with digests.
+"""Files of models: the findings of `build` as JSON, after a header line with versions and digests.
 
     {"format", "version", "jax", "precision", "scene", "sha256"}
     [how, {what: finding}]
 
 `scene`: digest of its class, methods and values; `sha256`: digest of the second line; `how`: arguments of
-`build`; `what`: the function that computes the finding, and its case. A dataclass in `KINDS` or a graph is
-{its name: its fields}, an array {"array": [type, entries]}, a tuple {"tuple": [...]}, a dictionary {"dict":
-pairs}.
+`build`; `what`: the name of the function that computes the finding, and its case. An object of a class in
+`KINDS` is written as {class name: fields}, an array as {"array": [type, shape, entries]}, a tuple as
+{"tuple": [...]}, a dictionary as {"dict": pairs}.
 """
 
 import hashlib
@@ -31,23 +31,23 @@ KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram,
 
 
 def write(path: FilePath, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
-    """Write the findings about a scene and `how` to build it. Keys of findings are the names of the functions
-    that compute them and the first part of their cache key.
+    """Write the findings about a scene and `how` to build it. The key of a finding is the name of the
+    function that computes it and the first part of its cache key.
     """
     check_place(path)
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
     except TypeError as error:
         raise ValueError(
-            f"`{type(scene).__name__}` has parts kept as JAX calls, so its model cannot be "
+            f"`{type(scene).__name__}` has parts that remain JAX calls, so its model cannot be "
             f"saved ({error}); build it again instead"
         ) from None
     write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
 
 
 def read(path: FilePath, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
-    """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file
-    is damaged or does not match.
+    """Return the findings about a scene and the arguments of its `build`. Raises ValueError if the file is
+    damaged or belongs to another scene, version or precision.
     """
     head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)

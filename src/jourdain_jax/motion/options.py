@@ -1,5 +1,5 @@
-"""Options of a simulation: one object for `simulate`, `rollout`, `fit`, `Study` and similar functions, which
-also accept its fields by name.
+"""Options of integration: one object for `simulate`, `rollout`, `fit`, `Study` and similar functions. These
+functions also accept its fields by name.
 """
 
 import difflib
@@ -36,19 +36,19 @@ class Options:
     """Options of integration.
 
     - `rtol`, `atol`: tolerances of a step, relative and absolute.
-    - `solver`: a diffrax solver, run by `diffrax.diffeqsolve` (except Tsit5, Dopri5 and Dopri8, which run in
-      this package's loop), or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`,
-      `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their
-      `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
+    - `solver`: a diffrax solver or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`,
+      `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`. `diffrax.diffeqsolve` runs diffrax's solvers,
+      except Tsit5, Dopri5 and Dopri8, which run in this package's loop. The last three solvers of `jj` take
+      equal steps of at most their `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
     - `max_steps`: maximum number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so that
-      brief loads and dips of events are not missed; inf: no limit.
+      brief loads and brief dips of event values are not missed; inf: no limit.
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
-      motion; events at which it continues stay active. `work`: integrate the work of loads without a
+      motion; events after which it continues stay active. `work`: integrate the work of loads that have no
       potential.
-    - `max_transitions`: maximum number of events at which a motion continues (`jj.Event`).
-    - `retry`: repeat a failed motion with the full state if its independent speeds became invalid, or by an
-      implicit solver if it is stiff and no `solver` is given. `trajectory.fallback` and the summary report a
-      repetition. Inside your own `jit` or `vmap`, or with False, the result code stays.
+    - `max_transitions`: maximum number of events after which a motion continues (`jj.Event`).
+    - `retry`: repeat a failed motion with the full state if its independent speeds became invalid, or with an
+      implicit solver if it is stiff and no `solver` is given. `trajectory.fallback` and the summary report
+      the retry. With False, or inside your own `jit` or `vmap`, there is no retry.
 
     `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
@@ -79,7 +79,7 @@ class AllOptions(Options):
     formulation: "Formulation | None" = None
     backend: str = "auto"
     memory: int | None = None  # of a model: limit in bytes for batches and reverse mode; None: `setup.MEMORY`
-    alongside: bool = False  # whether one run gives values and tangents, for `jvp` and `jacfwd` only
+    alongside: bool = False  # compute values and tangents in one run; for `jvp` and `jacfwd` only
 
 
 class OptionFields(TypedDict, total=False):
@@ -157,10 +157,10 @@ def as_options(
     refused: Mapping[str, str] | None = None,
     scene=None,
 ) -> AllOptions:
-    """Return the options of a call of `function`: the fields of the object, overridden by options by name.
+    """Return the options of a call of `function`: the fields of `options`, overridden by those given by name.
 
-    `refused`: names that do not apply to this function, with reasons; `scene`: a model, which supplies
-    formulation, backend and memory. Raises TypeError for refused and unknown names, ValueError for wrong
+    `refused`: names that do not apply to this function, with reasons. `scene`: if it is a model, it supplies
+    formulation, backend and memory. Raises TypeError for refused and unknown names, ValueError for invalid
     values.
     """
     of_model = (
@@ -189,8 +189,8 @@ def as_options(
 
 
 def bytes_of(memory: Any) -> int:
-    """Return the bytes for `memory`: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB"
-    (2^20). Raises ValueError for anything else.
+    """Return the number of bytes that `memory` states: a number, or a text such as "2GB" (1 GB = 10^9 bytes)
+    or "500 MiB" (1 MiB = 2^20 bytes). Raises ValueError for anything else.
     """
     found = re.fullmatch(
         r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower()
@@ -203,7 +203,7 @@ def bytes_of(memory: Any) -> int:
 
 
 def alongside(options: AllOptions) -> AllOptions:
-    """Return options for computing values and tangents in one run, for `jvp` and `jacfwd` only."""
+    """Return the options, set to compute values and tangents in one run; for `jvp` and `jacfwd` only."""
     return replace(options, alongside=True)
 
 
@@ -221,7 +221,7 @@ _POSITIVE = (
     "a positive finite number; pass a tolerance such as 1e-8",
     "pass one number, such as 1e-8",
 )
-_NUMBERS = {  # condition, expected value, and advice
+_NUMBERS = {  # condition, expectation and advice
     "rtol": _POSITIVE,
     "atol": _POSITIVE,
     "max_step": (
@@ -266,7 +266,7 @@ def _check(options: AllOptions) -> None:
 
 
 def _meant(value) -> str:
-    """Return the solver that a string or class probably means."""
+    """Return code for the solver that a string or class probably means; empty if none is similar."""
     kind = diffrax.AbstractSolver
     if isinstance(value, type) and issubclass(value, kind | ImplicitMethod | Taylor):
         return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"

@@ -1,13 +1,14 @@
-"""Retries of failed motions, with `retry=True`: one rule for single motions and for batches.
+"""Retry failed motions if `retry=True`, by one rule for single motions and batches.
 
-    FULL_STATE    its independent speeds or its program became invalid: use the full state and dense matrices
-    IMPLICIT      an explicit solver with steps limited by stability ran out of steps: use Radau's method
+    FULL_STATE    full state and dense matrices, if the independent speeds or the program became invalid
+    IMPLICIT      Radau's method, if an explicit solver ran out of steps because stability limited them
 
-Retries add up, and each is made once: a stiff motion with invalid independent speeds runs with the
-full state by Radau's method.
+Each change is made at most once, and changes add up: a stiff motion with invalid independent speeds finally
+runs with the full state by Radau's method.
 
-A mode exp(-r t), however small, limits the step h of an explicit method: h r is at most about 3 for Tsit5, 6
-for Dopri8. A motion that ran out of steps near that limit is stiff; the criterion here is `h r >= 1`.
+A decaying mode exp(-r t), however small, limits the step h of an explicit method: h r is at most about 3 for
+Tsit5 and 6 for Dopri8. A motion that ran out of steps near this limit is stiff. The criterion here is
+`h r >= 1`.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 
 OUT_OF_STEPS = (result_codes.MAX_STEPS, result_codes.SHRANK)
 
-# static fields of a trajectory, which tell how a sample was repeated
+# static fields of a trajectory that describe how a sample was retried
 RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")
 
 
@@ -43,7 +44,7 @@ def retried(
     motion: Trajectory,
     options: AllOptions,
 ) -> Trajectory:
-    """Repeat a motion until a retry succeeds or none is left; unchanged if its result is traced."""
+    """Retry a motion until it succeeds or no retry is left. Return it unchanged if its result is traced."""
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -58,18 +59,18 @@ def lanes_retried(
     options: AllOptions,
     chunk: int,
 ):
-    """Repeat failed samples by the rule for single motions. Return all samples, and for each kind of retry
-    the `RERUN_FIELDS` of its samples.
+    """Retry failed samples by the rule for single motions. Return all samples, and the `RERUN_FIELDS` of each
+    kind of retry.
 
-    `run`: returns motions of samples with these indices and options; `form`: returns their integrated state;
-    `begun`: their start times; `chunk`: as in `rollout`.
+    `run(options, indices)`: motions of these samples; `form(options)`: their vector field; `begun`: start
+    times of all samples; `chunk`: as in `rollout`.
     """
     reruns: dict[int, tuple] = {}
     while (again := _next_retries(form, lanes, begun, options)).any():
         for way in np.unique(again[again > 0]).tolist():
             chosen, changed = np.flatnonzero(again == way), _with_retries(way, options)
             for first in range(0, len(chosen), chunk):
-                # a power of two, so that few programs are compiled
+                # a power of two, so that only few sizes are compiled
                 size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))
                 index = chosen[np.minimum(np.arange(first, first + size), len(chosen) - 1)]
                 new = run(changed, index)
@@ -81,7 +82,7 @@ def lanes_retried(
 def _next_retries(
     form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions
 ) -> Int[np.ndarray, "lanes"]:
-    """Return the next retry of each sample, including all earlier changes of its run; AS_ASKED: none."""
+    """Return the next retry of each sample, including all changes already made; AS_ASKED: none."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
     found = np.full(lanes.result.shape, result_codes.AS_ASKED)
     codes = np.asarray(lanes.result)
@@ -89,7 +90,7 @@ def _next_retries(
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
-        # copy all samples to the host only if one may run again
+        # copy the samples to the host only if one may be retried
         known = jax.tree.map(np.asarray, lanes) if again.size else lanes
         for i in again:
             found[i] = _next_retry(field, at_index(known, i), begun[i], options)
@@ -97,7 +98,7 @@ def _next_retries(
 
 
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """Replace the samples at `index` by those of another run."""
+    """Replace the samples at `index` by those of `again`."""
     leaves, treedef = jax.tree.flatten(lanes)
     new = [np.array(x) for x in leaves]
     for old, y in zip(new, jax.tree.leaves(again), strict=True):
@@ -106,8 +107,8 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 
 
 def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:
-    """Return the retries of a `motion` from `t0`: all earlier ones and one more; AS_ASKED if none is left.
-    `field`: the integrated field; `options`: the original options.
+    """Return the changes for the next run of a `motion` from `t0`: those already made and one more; AS_ASKED
+    if no retry is left. `field`: the integrated field; `options`: the original options.
     """
     if np.all(known_numbers(motion.result) <= result_codes.EVENT):
         return result_codes.AS_ASKED
@@ -123,7 +124,7 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
 
 
 def _with_retries(retries: int, options: AllOptions) -> AllOptions:
-    """Return the options for these retries."""
+    """Return the options with the changes that `retries` encodes."""
     if retries & result_codes.FULL_STATE:
         # dense matrices support no Taylor series
         solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver
@@ -134,15 +135,13 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
             solver=solver,
         )
     if retries & result_codes.IMPLICIT:
-        # an implicit step costs tens of explicit ones, so allow a tenth of their number
+        # an implicit step costs as much as tens of explicit ones, so allow a tenth as many
         options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
     return options
 
 
 def _marked(motion: Trajectory, retries: int) -> Trajectory:
-    """Return one or several motions, marked as repeated by these retries. A motion that runs out of steps
-    again counts as stiff.
-    """
+    """Record `retries` in one motion or several. A motion that ran out of steps again gets the code STIFF."""
     code = motion.result
     if retries & result_codes.IMPLICIT:
         code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), result_codes.STIFF, code).astype(code.dtype)
@@ -164,8 +163,8 @@ def lost_codes(field: VectorField) -> tuple[int, ...]:
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
-    """Return whether a `motion` from `t0` ran out of steps because stability limited them;
-    False if its numbers are traced.
+    """Return whether a `motion` from `t0` ran out of steps because stability limited their length. False if
+    its numbers are traced.
     """
     known = numbers_where_known((field, motion, t0))
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or known is None:
@@ -179,7 +178,7 @@ def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
 
 @eqx.filter_jit
 def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state state"]:
-    """Return the Jacobian of the rates at the end state, without the work."""
+    """Return the Jacobian of the rates at the end state, excluding the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
     y = field.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))

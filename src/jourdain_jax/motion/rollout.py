@@ -1,8 +1,7 @@
 """Batches of motions with different starts, parameters, or both. Each sample has its own result, and a
-failing one does not affect the others.
+failed sample does not affect the others.
 
-Samples of one chunk run in lockstep as one vmapped integration; chunks run in sequence
-through the same compiled program.
+The samples of a chunk are integrated together; chunks run one after the other in the same compiled program.
 """
 
 import dataclasses
@@ -55,13 +54,13 @@ class Rollout(Printed, eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading batch axis."""
 
     lanes: Trajectory
-    reruns: tuple[tuple[int, tuple], ...] = static(default=())  # fallback -> `RERUN_FIELDS` of such samples
+    reruns: tuple[tuple[int, tuple], ...] = static(default=())  # (fallback, `RERUN_FIELDS` of these samples)
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
 
     def __getitem__(self, name: str) -> Float[Array, "lanes times *shape"]:
-        """Return a coordinate or speed by name, of all samples at all times."""
+        """Return the coordinate or speed `name` of all samples at all times."""
         return jax.vmap(lambda lane: lane[name])(self.lanes)
 
     def __contains__(self, name: str) -> bool:
@@ -93,17 +92,17 @@ class Rollout(Printed, eqx.Module):
 
     @property
     def continued(self) -> np.ndarray:
-        """Return the indices of samples whose independent speeds became invalid, and which were
-        repeated with the full state.
+        """Return the indices of samples that were retried with the full state because their independent
+        speeds became invalid.
         """
         return np.flatnonzero(np.asarray(self.lanes.fallback) & result_codes.FULL_STATE)
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
-        """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
-        `levels` (0 to 1), shape (levels, times).
+        """Return quantiles of the coordinate or speed `name` over the batch, for `levels` between 0 and 1.
+        Shape (levels, times).
 
-        Samples that have ended are omitted from then on; NaN if none remain. Raises ValueError for
-        samples with different saved times.
+        A sample counts until it ends; NaN once all have ended. Raises ValueError if samples have different
+        saved times.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
             raise ValueError(
@@ -123,14 +122,14 @@ class Rollout(Printed, eqx.Module):
         """Return coordinates, speeds, result codes and parameters as an `xarray.Dataset`
         along `lane` and `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, as in
-        `Trajectory.to_xarray`. ImportError without xarray.
+        `units`: units of coordinates and speeds by name, as in `Trajectory.to_xarray`. Raises ImportError
+        without xarray.
         """
         return labels.to_xarray(self.lanes, units)
 
     def to_pandas(self):
-        """Return coordinates and speeds as a `pandas.DataFrame`, one row per sample and time
-        (s). ImportError without pandas.
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row per sample and time (s). Raises
+        ImportError without pandas.
         """
         return labels.to_pandas(self.lanes)
 
@@ -183,20 +182,20 @@ def rollout(
     options: Options | None = None,
     **by_name: Unpack[MotionFields],
 ) -> Rollout:
-    """Simulate a batch of motions; the samples of the batch are called lanes.
+    """Simulate a batch of motions. The samples of the batch are called lanes.
 
-    - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a
-      `State` with a leading axis of lanes.
-    - `parameters`: parameter name -> array with a leading axis of lanes, for parameters that differ between
-      lanes.
-    - `chunk`: number of lanes that run together (default: on a CPU 512, otherwise all), fewer if they would
-      exceed the `memory` given to `jj.build` (4 GiB); `progress`: a bar (default: with several chunks).
+    - `starts`: start values by name, each a number or an array of shape (lanes,) (as in `jj.start`, which
+      solves for omitted values), or a `State` with a leading axis of lanes.
+    - `parameters`: parameters that differ between lanes, by name: arrays with a leading axis of lanes.
+    - `chunk`: number of lanes that run together (default: 512 on a CPU, otherwise all). It is reduced to stay
+      within the `memory` given to `jj.build` (default: 4 GiB). `progress`: show a progress bar (default: if
+      there are several chunks).
     - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All
-      lanes have the same inputs; for different ones use `jax.vmap` of `simulate`.
+      lanes have the same inputs; for different inputs use `jax.vmap` of `simulate`.
 
-    Raises ValueError for unknown names and unequal lengths. Failing lanes do not raise: see `Rollout.failed`
-    and `print(rollout)`. Derivatives of results after a failure are NaN; `jnp.where(rollout.lanes.succeeded,
-    ..., 0.0)` excludes such lanes from a loss and from its derivatives.
+    Raises ValueError for unknown names and unequal lengths. A failed lane raises no error: see
+    `Rollout.failed` and `print(rollout)`. Derivatives of a failed motion are NaN;
+    `jnp.where(rollout.lanes.succeeded, ..., 0.0)` excludes failed lanes from a loss and from its derivatives.
 
     **Examples**
 
@@ -205,7 +204,7 @@ def rollout(
         lanes = jj.rollout(disc, starts, parameters={"mass": jnp.full(16, 2.0)}, t1=1.0)
         print(lanes)                                          # how many arrived, and why others did not
         lanes["lean"].shape, lanes.quantiles("lean").shape    # (16, 201) and (3, 201)
-        lanes.failed, lanes.lane(3).energies().balance        # numbers of failed lanes; one as a trajectory
+        lanes.failed, lanes.lane(3).energies().balance        # indices of failed lanes; energy of one motion
     """
     span = {name: by_name.pop(name, None) for name in SPAN}
     options = as_options(options, by_name, "rollout", scene=scene)
@@ -250,7 +249,7 @@ def rollout(
         )
 
     if is_traced((scene, fixed, varied, parameters, span, options)):
-        lanes = run(options, varied, parameters)  # differentiated or batched: one piece, no host loop
+        lanes = run(options, varied, parameters)  # differentiated or batched: one chunk, no loop on the host
         warn_of_jumps(form(options), lanes, is_traced((scene, parameters)))
         return Rollout(lanes)
 
@@ -279,9 +278,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
-    """Check times, and inputs for jumps between the times, if all samples have one known span.
+    """Check the times, and the inputs over the span, if all samples share one known span.
 
-    Other spans are traced: a sample with an invalid time then gets a result code.
+    Otherwise times are traced, and a sample with invalid times gets a result code.
     """
     ts, t0, t1 = (span[name] for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):
@@ -310,7 +309,7 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 
 def _with_arrays(options: AllOptions) -> AllOptions:
-    """Return options with their numbers as arrays, so that other values need no compilation."""
+    """Return the options with numbers as arrays, so that new values need no compilation."""
     real, (solver, order) = real_type(), solver_of(options)
     numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
@@ -318,7 +317,7 @@ def _with_arrays(options: AllOptions) -> AllOptions:
 
 
 def _lanes(scene: Scene, starts, parameters: dict):
-    """Return shared start values, varying ones, and the size of the batch."""
+    """Return the start values that all samples share, the others, and the size of the batch."""
     known = [name for name, _, _ in parameters_of(scene)]
     check_names(parameters, known, f"scene `{type(scene).__name__}` has no parameter `{{}}`")
     lengths = {
@@ -326,7 +325,7 @@ def _lanes(scene: Scene, starts, parameters: dict):
     }
     if isinstance(starts, State):
         many = starts.q.shape[:1] if starts.q.ndim == 2 else ()
-        # a state made directly has one guess for all samples
+        # a `State` made directly has one `guess` for all samples
         fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
@@ -369,6 +368,6 @@ def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
     chunk = usual if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(state_names(scene)) + 2)
-    # the stages of 512 samples fit the cache of a core, and a GPU runs some ten thousand at once; saved
-    # states of a chunk exist in four copies
+    # the stages of 512 samples fit the cache of a core, and a GPU runs some ten thousand samples at once;
+    # four copies of a chunk's saved states exist
     return max(1, min(count, chunk, memory // (4 * per_lane)))

@@ -1,15 +1,16 @@
-"""Warnings about derivatives of motions that amplify errors, as measured during differentiation, or that
-cross a jump of their loads.
+"""Warn of inaccurate derivatives: of motions that amplify errors, and of motions that cross a jump of their
+loads.
 
-In reverse mode, a value L of a motion has cotangents g = dL/dy at the states it uses and g_0 = dL/dy_0 at the
-start. With the error s = atol + rtol |y| that step-size control allows at one state,
+The amplification is measured during differentiation. In reverse mode, a function L of a motion has cotangents
+g = dL/dy at the states on which it depends and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, the
+error that step-size control allows per step,
 
     amplification = sum |g_0| s_0 / sum |g| s
     relative error of a derivative <~ steps amplification rtol
 
-because every step adds an error s, and the derivative is evaluated along a path that is off by the sum of
-these errors. In forward mode, d_0, d_m and d_1 are the tangents of the start, of the middle saved state and
-of the end; s is the error for the largest |y| of each number:
+because each step adds an error s, and the derivative is evaluated along a path displaced by the sum of these
+errors. In forward mode, let d_0, d_m and d_1 be the tangents of the start, of the middle saved state and of
+the end, and s the error for the largest |y| of each entry of the state:
 
     amplification = max |d_1|/s / max |d_0|/s              if only the start varies
                     (max |d_1|/s / max |d_m|/s)^2          otherwise; the smaller of both if the start varies
@@ -18,7 +19,7 @@ If the rates are f_1 before and f_2 after a jump at time s(p),
 
     dy/dp = (JAX's derivative) + (f_1 - f_2) ds/dp
 
-Steps count the relations that a motion crosses (`lowering/sides.py`).
+The loop over steps counts how often a motion crosses a relation such as `a < b` (`lowering/sides.py`).
 """
 
 import warnings
@@ -37,13 +38,13 @@ from jourdain_jax.scene.arguments import warn
 
 
 class SensitivityWarning(UserWarning):
-    """Warning that few digits of a derivative are right because the motion amplifies
-    errors, or that its loads jump.
+    """Warning that a derivative has few correct digits because the motion amplifies errors, or that it omits
+    the effect of a jump of the loads.
     """
 
 
 def _judge(amplification: float, rtol: float, steps: int) -> None:
-    """Warn if the tolerances of all steps together spoil a derivative."""
+    """Warn if the errors of all steps together make a derivative inaccurate (more than 5 %)."""
     error = steps * amplification * rtol
     if error > 0.05:
         text = (
@@ -55,8 +56,8 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
 
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
-    """Return `integrate(setup)`, whose derivative, outside `jit`, warns if the
-    motion amplifies errors too much.
+    """Return `integrate(setup)`. Differentiating the result outside `jit` warns if the motion amplifies
+    errors too much.
     """
     varies = tuple(name for name, part in setup._asdict().items() if is_traced(part))
     if not varies:
@@ -67,7 +68,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
         return integrate(setup)
     rtol, atol = float(known[2]), float(known[3])
     begun: list[np.ndarray] = []  # tangents of the start
-    looked_at: list[float] = []  # sizes of the states used, weighted by their cotangents
+    looked_at: list[float] = []  # sum |g| s over the states on which the result depends
 
     def weighed(values, cotangents) -> float:
         """Return `sum |g| (atol + rtol |y|)`, ignoring values that are not finite."""
@@ -97,7 +98,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
             )
 
         ended = sizes(tangents[2:])
-        first = sizes(begun) if begun else np.zeros_like(ended)  # zero if nothing varies the start
+        first = sizes(begun) if begun else np.zeros_like(ended)  # zero if the start does not vary
         half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
         with np.errstate(divide="ignore", invalid="ignore"):
             from_start = np.where(first > 0, ended / first, np.inf)
@@ -112,7 +113,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     def start_is_asked(cotangents):  # called last in reverse mode
         ended = sum(looked_at)
         looked_at.clear()
-        if ended > 0:  # ends of a traced motion are unknown
+        if ended > 0:  # zero if the motion is traced: its end states are unknown
             _judge(weighed(known[:2], cotangents) / ended, rtol, steps)
 
     at_start = tap_cotangents(tap_tangents((start.q, start.u), start_varies), start_is_asked)
@@ -131,8 +132,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """Warn if a differentiated motion crossed relations at which rates jump.
-    Traced crossings give no warning.
+    """Warn if a differentiated motion crossed a relation at which rates jump. No warning if the number of
+    crossings is traced.
     """
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
@@ -142,14 +143,14 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
         met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
             f"a motion of `{type(motions.scene).__name__}` {met} a jump of its loads (`<`, `where`, `sign`, "
-            "`floor`, ...); its derivatives omit the shift of the jump's time. Smooth the load, as by "
-            "`jnp.tanh`, or end the motion there by an event and start another"
+            "`floor`, ...); its derivatives omit the shift of the jump's time. Smooth the load, as with "
+            "`jnp.tanh`, or let an event end the motion there and start another"
         )
         warn(text, SensitivityWarning)
 
 
 def numbers_where_known(values):
-    """Return the values as numbers if they are differentiated outside `jit`; None if they are traced."""
+    """Return the values as numbers, also while they are differentiated outside `jit`; None if traced."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
     if is_traced(bare):
         return None

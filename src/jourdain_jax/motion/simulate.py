@@ -1,4 +1,4 @@
-"""Simulation: from a scene and a start to a `Trajectory`, by this package's loop over steps or by diffrax.
+"""Simulate a scene: integrate from a start to a `Trajectory`, by this package's loop over steps or diffrax.
 
 The default state is minimal (coordinates and independent speeds) if the independent speeds are well
 conditioned over the scene's domain and the constraints are linear or affine. Otherwise it is full
@@ -76,25 +76,25 @@ def simulate(
 
     **Arguments**
 
-    - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for
-      the scene's example.
-    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the
-      scene's `example_span` after t0); `ts`: times to save (default: 201 even ones), at each of which a step
-      ends.
-    - `inputs`: name -> number, function of time, or `Sampled`.
-    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as
-      `rtol=1e-10`, which take precedence, and two further settings:
+    - `start`: a `State`, a dictionary of named values (`jj.start` solves for omitted ones), or None for the
+      scene's example.
+    - `t0`, `t1`: start and end of the motion (s). Default of `t0`: the time of a `State`, otherwise 0; of
+      `t1`: the last of `ts`, otherwise `t0` plus the scene's `example_span`.
+    - `ts`: times to save, at each of which a step ends (default: 201, evenly spaced).
+    - `inputs`: inputs by name, each a number, a function of time, or `Sampled`.
+    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, such
+      as `rtol=1e-10`, which take precedence, and two further settings:
     - `formulation`: the equations to integrate, a `jj.Formulation(state, reduction, stabilisation)` (default:
       chosen for the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code, which needs llvmlite and a
-      default solver; "xla", that program compiled by XLA, which also supports third derivatives, derivatives
-      with respect to samples, `jax.export` and other devices; "dense", dense matrices; "auto" (default), the
-      first that applies. The first two take the same steps.
+      default solver; "xla", the same program compiled by XLA, which also supports third derivatives,
+      derivatives with respect to samples, `jax.export` and other devices; "dense", dense matrices; "auto"
+      (default), the first of these that applies. "native" and "xla" take the same steps.
 
     All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in
     all combinations (`jax.hessian`); other backends support forward mode of forward mode, to any order.
 
-    **Returns** a `Trajectory`. Failures set a result code, with a message that says what to do;
+    **Returns** a `Trajectory`. A failure sets a result code, whose message advises what to do;
     `trajectory.raise_if_failed()` raises `SimulationError`.
 
     **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the
@@ -105,7 +105,7 @@ def simulate(
         disc = jj.models.TiltingDisc()
         motion = jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=2.0)
         print(motion)                             # result, steps, drift of the energy, contact forces
-        motion["lean"], motion.q_end, motion.ts   # by name; as vectors
+        motion["lean"], motion.q_end, motion.ts   # a coordinate over time; end state; saved times
         motion.point("disc")                      # path of the mass centre
         motion.point("disc", (0, 0.5, 0))         # path of a point fixed in the body
 
@@ -129,8 +129,8 @@ def simulate(
 
 
 def _integrated(setup: Setup) -> Trajectory:
-    """Integrate the motion. Under `jax_debug_nans`, NaN after an event is only a marker; a failed motion is
-    integrated again, so that JAX reports the operation that made the NaN.
+    """Integrate the motion. Under `jax_debug_nans`, NaN may mark unreached times; a failed motion is
+    integrated again without this exception, so that JAX reports the operation that made the NaN.
     """
     if not jax.config.jax_debug_nans:
         return integrate(setup)
@@ -150,7 +150,7 @@ def set_up(
     options: Options | None = None,
     **by_name,
 ) -> Setup:
-    """Return the setup that `simulate` integrates for its arguments."""
+    """Return the setup that `simulate` would integrate for these arguments."""
     options = as_options(options, by_name, scene=None if type(options) is AllOptions else scene)
     return _set_up(modelled(scene, options.formulation, options.backend), start, t0, t1, ts, inputs, options)
 
@@ -170,7 +170,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     given_ts, (t0, ts, t1) = ts, span_and_times(scene, start, t0, t1, ts)
     if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
         raise ValueError(
-            f"`{type(scene).__name__}` has contacts with friction, which cannot run back in "
+            f"`{type(scene).__name__}` has contacts with friction, which cannot run backward in "
             f"time from t0 = {t0} to t1 = {t1} s; pass t1 > t0"
         )
     start, usual = _start(model, start, t0, inputs)
@@ -194,14 +194,14 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
         stopping=options.events,
     )
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
-    # as arrays, so that another tolerance needs no other program
+    # as arrays, so that a new tolerance needs no compilation
     tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))
     # diffrax's own guess would compile two more copies of the vector field
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     judged = model.once("judged", lambda: is_judged(scene))
     steps = tolerances, first_step, longest, integrator
-    apart = lambda: bool(abs(t1 - t0) > 1e3 * eps_of(t1) * abs(t1))  # else default times may coincide
+    apart = lambda: bool(abs(t1 - t0) > 1e3 * eps_of(t1) * abs(t1))  # otherwise default times may coincide
     fits = not is_traced(t0, t1, ts) and (given_ts is not None or apart())
     setup = Setup(scene, start, inputs, t0, t1, ts, field, *steps, usual, judged, fits, model.decided)
     if own is None:
@@ -218,8 +218,8 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
-    """Return the start on its constraints. A `State` stays unchanged; the integrating program projects it
-    with the typical sizes returned here.
+    """Return the start on its constraints. A `State` is returned unchanged, with the typical sizes by which
+    the compiled program will project it.
     """
     if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
@@ -229,10 +229,10 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
 
 
 def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMethod | Method", int | None]:
-    """Return the solver (by default chosen by tolerance) and, for Taylor series, the order. Raises ValueError
-    if a traced tolerance would have to decide.
+    """Return the solver, by default chosen by the tolerance, and the order if it is a Taylor series. Raises
+    ValueError if the tolerance is traced and no solver is given.
 
-    Warns if the precision cannot satisfy the tolerance.
+    Warns if the precision is too low for the tolerance.
     """
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
@@ -244,7 +244,7 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):
         raise ValueError(
-            "`rtol` is traced, but decides the default solver; pass a `solver` too, such as diffrax.Dopri8()"
+            "`rtol` is traced, so no default solver can be chosen; pass a `solver`, such as diffrax.Dopri8()"
         )
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
@@ -254,11 +254,11 @@ _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 
 
 def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, inputs=None) -> State:
-    """Return a state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`),
-    or None for the scene's example.
+    """Return the state for a `State`, a dictionary of named values (`jj.start` solves for omitted ones), or
+    None for the scene's example.
 
-    `inputs`: the scene's inputs at that time, a vector or by name (default: zero); velocity
-    constraints may depend on them.
+    `inputs`: the scene's inputs at that time, as a vector or by name (default: zero). Velocity constraints
+    may depend on them.
     """
     if isinstance(given, State):
         return given
@@ -295,7 +295,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
             "finite `t1` different from `t0`"
         )
     if ts is None:
-        ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # in NumPy if concrete, without compilation
+        ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # computed by NumPy if concrete, without compilation
     elif ends and len(known := known_numbers(ts)) and not _encloses(ends, known):
         raise ValueError(
             f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
@@ -305,13 +305,13 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
 
 
 def _encloses(ends: list[float], ts: np.ndarray) -> bool:
-    """Return whether the span from one end to the other encloses the saved times."""
+    """Return whether the saved times lie between the two ends, in the same direction."""
     return bool(ends_fit(float(ts[0]), float(ts[-1]), ends[0], ends[1], float(eps_of(ts))))
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
-    """Return the saved times, in NumPy if concrete. Raises ValueError unless they are a
-    monotonic vector of finite numbers.
+    """Return the saved times, a NumPy array if concrete. Raises ValueError unless they are finite and
+    strictly monotonic.
     """
     ts = vector_of_times(ts)
     known = known_numbers(ts)

@@ -1,4 +1,4 @@
-"""Consistent starts: a guess of q and u projected onto the constraints, and the size of the change.
+"""Consistent starts: project a guess of q and u onto the constraints, and report the size of the change.
 
 g(t, q) = 0,  phi(t, q, u) = 0
 """
@@ -63,15 +63,16 @@ _NOTHING: Mapping = MappingProxyType({})
 def consistent(
     scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: Labels = ()
 ) -> State:
-    """Return the state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds
-    M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
+    """Return the state nearest to (q, u) that satisfies the constraints g(t, q) = 0 and phi(t, q, u) = 0.
+    Coordinates are projected by Gauss-Newton steps, speeds orthogonally in the metric of the mass matrix M.
 
-    `inputs`: values of the scene's inputs (default: zero). `held`: names of
-    coordinates and speeds that stay fixed.
+    `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that stay
+    fixed.
 
-    Differentiable in any mode. `residual` is the remaining violation, infinite for numbers that are not
-    finite. No error is raised, so the function works inside jit and vmap. The quaternion (0, 0, 0, 0) has no
-    direction and stays unchanged, with a residual of 1/2. Raises ValueError for wrong shapes.
+    Differentiable in any mode. `residual` of the result is the remaining violation, infinite if a number is
+    not finite; a large residual raises no error, so the function works inside jit and vmap. The quaternion
+    (0, 0, 0, 0) has no direction and stays unchanged, with a residual of 1/2. Raises ValueError for wrong
+    shapes.
     """
     model, scene = modelled(scene), as_scene(scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
@@ -83,17 +84,16 @@ def consistent(
 
 
 def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None = None) -> State:
-    """Return the nearest state; if Newton's method fails, search by damped steps from q, then from other
-    configurations, `guesses()`.
+    """Return the nearest state. If Newton's method fails, search by damped steps from q, then from the
+    configurations `guesses()`.
     """
     given = scene, t, start, inputs
-    if not nothing_is_traced() and is_traced(given):  # the first check is cheaper
+    if not nothing_is_traced() and is_traced(given):  # cheaper check first
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
-    # project concrete numbers at once, also inside a trace, which would otherwise
-    # compile constants one by one
+    # evaluate concrete numbers at once, also within a trace, which would otherwise compile each operation
     with at_once():
         state, arrived = _compiled_projection(*given, None)
-        # rare, and slow to compile
+        # not compiled: rarely needed, and slow to compile
         if guesses is not None and len(start.usual.closures) and not np.asarray(arrived):
             by_xla = start._replace(usual=replace(start.usual, program=None))
             state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
@@ -125,27 +125,25 @@ def start(
     """Return a consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`,
     or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
-    `values`, by keyword or in a dictionary `given` (keywords take precedence), are held at time `t0` (s).
-    Values that contradict each other by at most 1.5e-5, as rounded numbers may, move onto the constraints.
+    `values` at time `t0` (s), by keyword or in a dictionary `given` (keywords take precedence), stay fixed.
+    Only if they violate the constraints by at most 1.5e-5, as rounded numbers may, are they moved onto them.
 
-    Omitted coordinates start at zero (a quaternion at the identity) and follow from the constraints. If that
-    fails or leaves the scene's `domain`, the search begins again at other states of the domain, nearest
-    first; `guess` of the result counts them. `near`: initial guesses of coordinates by name. Guessed
-    coordinates may end outside the domain, and so may coordinates that the constraints determine uniquely. If
-    a quaternion is partly given, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, its other components are
-    zero.
+    The search for omitted coordinates begins at zero (for a quaternion: at the identity). If it fails or
+    leaves the scene's `domain`, it begins again at other states of the domain, nearest first; `guess` of the
+    result counts these attempts. `near`: initial guesses of coordinates by name. Guessed coordinates, and
+    coordinates that the constraints determine uniquely, may end outside the domain. If only some components
+    of a quaternion are given, as in `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the others are zero.
 
-    Omitted privileged speeds stay zero, and the dependent speeds follow from the constraints. If dependent
-    speeds are given, all others are determined by the smallest change that satisfies the constraints, in
-    the metric of the mass matrix.
+    Omitted independent ("privileged") speeds are zero, and dependent speeds follow from the constraints. If a
+    dependent speed is given, the omitted speeds change as little as possible from zero, in the metric of the
+    mass matrix, to satisfy the constraints.
 
-    `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; velocity constraints
-    may depend on their values at `t0`. In a program to export, pass `jj.build(scene,
-    backend="xla")` instead of the scene.
+    `inputs`: inputs by name, as in `simulate`; velocity constraints may depend on their values at `t0`. In a
+    program to export, pass `jj.build(scene, backend="xla")` instead of the scene.
 
     Raises ValueError for an unknown name, a value that is not finite, and concrete values that contradict the
-    constraints or belong to no state of the domain. For traced values `residual` is infinite instead, and a
-    motion from there ends with a code.
+    constraints or leave no state within the domain. For traced values, `residual` is then infinite, and a
+    motion from this start ends with a result code.
     """
     model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
@@ -163,8 +161,8 @@ def start(
 
 
 def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NOTHING) -> State:
-    """Return the start that `start` describes; `inputs` at time `t` (an array): a
-    vector, or by name (None: zero).
+    """Return the start from named values, as documented in `start`. `inputs`: values at time `t` (an array),
+    as a vector or by name (None: zero).
     """
     scene = model.scene
     q, u, given = vectors_named(scene, {**near, **values})
@@ -205,8 +203,8 @@ def _check_finite(name: str, value) -> None:
 
 
 def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
-    """Return masks of free coordinates, free speeds and bounded coordinates; typical sizes; and whether given
-    values may contradict each other.
+    """Return masks of free coordinates, free speeds, and coordinates that must stay in the domain; typical
+    sizes; and whether given values may contradict each other.
 
     Omitted privileged speeds stay zero unless a dependent speed is given. Coordinates that are neither given
     nor guessed must lie in the domain, unless the constraints are affine and determine them uniquely.
@@ -222,16 +220,16 @@ def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
         slopes = [n for (_, k), n in program.G.items() if free_q[k]]
         bounded = bounded & any(depend_on(program.graph, slopes, np.array(program.q)[free_q].tolist()))
     with at_once():
-        # passing these on takes a third of the time of NumPy arrays
+        # JAX arrays are passed to a program three times faster than NumPy arrays
         on_device = jax.device_put((free_q, free_u, bounded))
     return (*on_device, usual), may_contradict(scene, known, free_q, free_u)
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
-    """Move the whole start onto the constraints if its residual is too small for a contradiction.
+    """Project the whole start onto the constraints if its residual is too small for a contradiction.
 
-    If the residual is only round-off, the numbers stay. Traced values still get the derivatives of a moved
-    start, because values that agree at these parameters may contradict each other at others.
+    If the residual is only round-off, the start is unchanged. Traced values always get the derivatives of the
+    projection, because values that agree for these parameters may contradict each other for others.
     """
     near = start.residual < contradiction(start.q.dtype)
     if not known_numbers(near & (start.residual > OFF * eps_of(start.q))).all():  # more than round-off

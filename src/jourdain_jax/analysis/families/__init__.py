@@ -2,7 +2,6 @@
 
     equations.py -> curve.py -> special_points.py -> family.py
 
-`critical.py` follows special points, `chart.py` boundaries, as parameters change; `periodic.py` finds orbits.
-
-Open `family.py` first.
+As parameters change, `critical.py` follows special points, and `chart.py` follows boundaries of stability.
+`periodic.py` finds periodic orbits. Open `family.py` first.
 """

@@ -1,5 +1,5 @@
-"""Stability charts: curves of critical points in a plane of two numbers, where eigenvalues of a steady motion
-cross the imaginary axis.
+"""Stability charts: curves in a plane of two parameters on which eigenvalues of steady motions cross the
+imaginary axis.
 """
 
 from collections.abc import Mapping
@@ -22,17 +22,17 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False, eq=False)
 class StabilityChart(Printed):
-    """Curves on which modes cross the imaginary axis; `mode, curve = chart.boundaries[0]`,
+    """Curves on which modes cross the imaginary axis: `mode, curve = chart.boundaries[0]`,
     `curve["rear_spin_rate"]`.
     """
 
-    values: Float[np.ndarray, "values"]  # of the first number, equidistant
-    # mode, and a point for each value: NaN, with a code, if there is none
+    values: Float[np.ndarray, "values"]  # of the first axis, equidistant
+    # a mode, and one point for each value; a point that does not exist is NaN and has a code
     boundaries: tuple[tuple[str, CriticalPoint], ...]
     bands: tuple[
         Float[np.ndarray, "values"], ...
-    ]  # standard deviations of the second number; NaN without a prior
-    middle: Family  # along the second number, at the middle of the first: it shows the stable side
+    ]  # standard deviations of the second axis; NaN without a prior
+    middle: Family  # along the second axis, at the middle value of the first; shows which side is stable
 
     def _text(self) -> str:
         return "\n".join(f"{mode}, {curve}" for mode, curve in self.boundaries)
@@ -48,27 +48,29 @@ def stability_chart(
     points: int = 101,
     **asked,
 ) -> StabilityChart:
-    """Return the boundaries of stability of steady motions in a plane of two numbers.
+    """Return the boundaries of stability of steady motions in a plane of two quantities.
 
         chart = jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (5.0, 35.0)})
         for mode, curve in chart.boundaries:
             print(mode, curve["rear_spin_rate"], curve.speed)
 
     **Arguments**
-    - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
-    - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
-      parameter, at least 3.
-    - `prior`: parameter (one number) -> `jj.studies.Normal`, such as `measured_bicycle(...).prior`.
-      `chart.bands` then has the standard deviations of the second number on each boundary, to first order,
-      for independent parameters.
+    - `axes`: two axes. The first is a parameter of the scene, the second a coordinate or a speed, each with
+      its first and its last value.
+    - `guess`: named values of one of the motions (omitted ones are zero); `points`: number of values along
+      the first axis, at least 3.
+    - `prior`: a `jj.studies.Normal` for scalar parameters, by name, such as `measured_bicycle(...).prior`.
+      `chart.bands` then contains the standard deviation of the second quantity along each boundary, to first
+      order, for independent parameters.
     - `asked`: arguments of `family`: `held`, `inputs`, `names`.
 
-    A family along the second number, at the middle value of the first, finds the boundaries. Each is then a
-    `critical` point as a function of the first number, accurate to round-off. A boundary that does not reach
-    the middle value is missed, and one that turns back along the first number has gaps.
+    A family along the second axis, at the middle value of the first, finds the boundaries. Each boundary is
+    then computed as a `critical` point for each value of the first axis, accurate to round-off. A boundary
+    that does not reach the middle value is missed, and a boundary that turns back along the first axis has
+    gaps.
 
-    **Returns** a `StabilityChart`. **Raises** errors as in `family`, and ValueError unless there are two
-    axes, or for a prior that is no `jj.studies.Normal`.
+    **Returns** a `StabilityChart`. **Raises** the errors of `family`, and ValueError unless there are two
+    axes, or for a prior that is not a `jj.studies.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
         raise ValueError(
@@ -77,7 +79,7 @@ def stability_chart(
         )
     (first, ends), (second, (begin, end)) = axes.items()
     values = np.linspace(*ends, points)
-    # the ends are checked as values of the parameter
+    # creating a scene with each end value checks that the value is valid
     scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
     known, place, given = middle.equations, numbered(scene), dict(prior or {})
@@ -98,7 +100,7 @@ def stability_chart(
     for change in middle.changes:
         if change.kind != DOUBLE:
             special, curve = special_at(known, change), []
-            for x in values:  # compiled faster than a batch
+            for x in values:  # one point compiles faster than a batch
                 point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
                 by_all = (
                     np.asarray(special.program.pulled(numbers, inverse[k]))
@@ -114,8 +116,8 @@ def stability_chart(
 
 @compiled_quickly
 def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
-    """Return the point of a scene with this value, the arguments of the program there, and the pseudo-inverse
-    of the equations' Jacobian.
+    """Return the critical point for the value `x` of the first axis, the arguments of the program there, and
+    the pseudo-inverse of the equations' Jacobian.
     """
     scene = scene.replace(**{first: x})
     X, inverse, *found = followed_to(special, scene)

@@ -1,4 +1,4 @@
-"""Continuation of a curve of steady motions: its start, eigenvalues, end, and special points."""
+"""Continue a curve of steady motions: find its start, its points, its ends and its special points."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,8 +24,8 @@ from jourdain_jax.calculus.reals import all_finite, largest
 def followed(
     equations: Motions, begin: Point, targets: Targets, most: int
 ) -> tuple[list[Point], tuple[str, str]]:
-    """Return all points of a curve in order, and the reasons why it ends at either side. With targets, the
-    curve is followed only towards them.
+    """Return all points of a curve in order, and the reasons why it ends on either side. If there are
+    targets, the curve is followed only towards them.
     """
     ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
     if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
@@ -40,7 +40,7 @@ def followed(
 def special(
     equations: Motions, points: Sequence[Point], turning: dict[str, int]
 ) -> Iterator[tuple[Test, Point]]:
-    """Yield special points between the points, in order."""
+    """Yield the special points between the points of a curve, in order, each with its test."""
     for here, there in pairwise(_with_dips(equations, points, turning)):
         found = []
         for test in tests_between(equations, here, there, turning):
@@ -50,15 +50,15 @@ def special(
                     (test, point) if point else (replace(test, kind=f"{test.kind}, before this point"), there)
                 )
         branch = next((point for test, point in found if test.kind == "branch point"), None)
-        # near a branch point tangents lose digits, so points this close count as the branch point
+        # near a branch point tangents lose digits, so special points this close count as the branch point
         if branch is not None:
             found = [(test, branch if largest(point.z - branch.z) < 1e-4 else point) for test, point in found]
         yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
 
 
 def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> list[Point]:
-    """Return the points, with one inserted wherever a test nearly vanishes between two of them (except near
-    branch points), since two special points may lie there.
+    """Insert a point wherever a test nearly vanishes between two points, except near branch points: the test
+    may vanish twice there, at two special points.
     """
     points, k = list(points), 1
     while k < len(points) - 1:
@@ -83,8 +83,8 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
 
 
 def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
-    """Return the steady motion near the guess. All named values are kept if possible; otherwise only held or
-    followed ones.
+    """Return the motion near the guess. It keeps all `named` values if possible, otherwise only the `kept`
+    ones (held or followed).
     """
     z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
     if not all_finite(look.R):
@@ -96,7 +96,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
             break
     else:
         raise ValueError(
-            f"no {equations.what[:-1]} of `{scene}` was found near the guess; search farther by `jj.steady`"
+            f"no {equations.what[:-1]} of `{scene}` was found near the guess; search farther with `jj.steady`"
         )
     z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
@@ -104,7 +104,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
     if count == 0:
         raise ValueError(
             f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold "
-            "fewer quantities, or name a parameter by `vary`"
+            "fewer quantities, or name a parameter in `vary`"
         )
     if count > 1:
         free = [
@@ -113,7 +113,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
             if share > 1e-3
         ]
         raise ValueError(
-            f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: "
+            f"the {equations.what} of `{scene}` near this one have {count} freedoms, but a family has one: "
             f"name {count - 1} of {', '.join(free)} in `held`, or start next to a branch point"
         )
     return Point(z, V[-1], look, equations.eigenvalues(look, V[-1]))

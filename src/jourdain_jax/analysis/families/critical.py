@@ -1,4 +1,5 @@
-"""Special points of steady motions as functions of the parameters p, by the implicit function theorem.
+"""Compute special points of steady motions as functions of the parameters p, by the implicit function
+theorem.
 
     G(X, p) = 0,   dX = -G_X+ G_p dp,   X = (z, a, b, w)
     G = ( R,  C a,  C b,  F (a b) - (a b) S(w),  size and phase of a and b )
@@ -8,9 +9,9 @@
     zero eigenvalue              F a = 0,  F b = 0, with b along the steady motions that continue at the same
                                  parameters
 
-R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue; S(w): the 2
-x 2 matrix of the relations below G. G and its derivatives are one scalar program. It has redundant,
-consistent rows: G_X has full column rank, and its pseudo-inverse is computed by Q R.
+R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue; S(w): the
+2 x 2 matrix of the three cases listed below G. One scalar program computes G and its derivatives. G has
+redundant but consistent rows. G_X has full column rank; its pseudo-inverse is computed by Q R.
 """
 
 from itertools import combinations
@@ -49,12 +50,12 @@ SHAPES = {
 
 
 class CriticalPoint(Printed, eqx.Module):
-    """A special point of a family; `point["lean"]`, `point.speed`. All numbers are NaN unless `code` is 0."""
+    """Special point of a family: `point["lean"]`, `point.speed`. All numbers are NaN unless `code` is 0."""
 
     state: State
     parameters: dict[str, Float[Array, "*batch"]]  # the parameters that vary along the family
-    eigenvalue: Complex[Array, "*batch"]  # 1/s, crossing the axis or double
-    # least pivot of the equations over the largest; near zero, special points are close together
+    eigenvalue: Complex[Array, "*batch"]  # 1/s; on the imaginary axis, or double
+    # smallest pivot of the equations divided by the largest; near zero, special points are close together
     condition: Float[Array, "*batch"]
     code: Int[Array, "*batch"]
     kind: str = static()
@@ -84,7 +85,7 @@ class CriticalPoint(Printed, eqx.Module):
 
 
 class Special(eqx.Module):
-    """The equations of a special point, and the family's point from which it is followed as parameters
+    """Equations of a special point, and its values X in the family, from which it is followed as parameters
     change.
     """
 
@@ -105,7 +106,7 @@ class Special(eqx.Module):
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
     def normal(self, X: Unknowns) -> Unknowns:
-        """Return X with a of unit length; for a pair a + i b."""
+        """Return X scaled to unit length of a, or of a + i b for a pair."""
         z, a, b, w = self.parts(X)
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
@@ -117,8 +118,8 @@ class Special(eqx.Module):
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return rows L and c with L X = c. They fix the held values, the size and phase of a and b (relative
-        to a nearby point), and w if it is zero.
+        """Return L and c of the linear equations L X = c. They fix the held values, the size and phase of a
+        and b (relative to the point `near`), and w if it is zero.
         """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
@@ -146,7 +147,7 @@ class Special(eqx.Module):
         return jnp.concatenate([rows, jnp.column_stack([L, L @ X - c])])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
-        """Return the Gauss-Newton step. In the triangle of (G_X, G) the last column is Q' G."""
+        """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""
         T = jnp.linalg.qr(self.linearised(scene, X, near), mode="r")
         return jax.scipy.linalg.solve_triangular(T[:-1, :-1], T[:-1, -1])
 
@@ -169,7 +170,7 @@ class Special(eqx.Module):
 
 @compiled_quickly
 def _solution(special: Special, scene: Scene) -> CriticalPoint:
-    """Return the point of a scene, differentiable twice."""
+    """Return the special point of a scene. It is twice differentiable."""
     X, inverse, condition, code = jax.lax.stop_gradient(followed_to(*jax.lax.stop_gradient((special, scene))))
     near = X
     for _ in range(2):  # each carries one order of derivatives
@@ -178,7 +179,7 @@ def _solution(special: Special, scene: Scene) -> CriticalPoint:
 
 
 class _Followed(NamedTuple):
-    """A point followed to a share `done` of the change of the parameters."""
+    """Point that has been followed through a share `done` of the change of the parameters."""
 
     X: Unknowns
     done: Scalar
@@ -191,10 +192,11 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. X is
     NaN unless the code is 0.
 
-    Parameters change linearly from the family's to the given ones, first in one step. A step is accepted if
-    each of three corrections of Newton's method is at most 0.3 of the one before; otherwise it is shortened.
-    Such corrections stay near the start, so that they cannot lead to another point. The point is found once
-    the next correction, at the rate of the last two, would be below 1e-7.
+    Parameters change linearly from the family's to the given ones, at first in a single step. Three
+    corrections by Newton's method follow. The step is accepted if each correction is at most 0.3 of the
+    previous one; otherwise it is shortened. Corrections that shrink this fast stay close to the start and do
+    not lead to another point. The point is found if the next correction, at the rate of the last two, would
+    be below 1e-7.
     """
     zero, none = jnp.array(0.0), jnp.array(0)
     start = _Followed(special.normal(special.X), zero, zero + 1, none, jnp.array(False))
@@ -232,8 +234,8 @@ def _to_the_end(special: Special, scene: Scene, at: _Followed) -> _Followed:
 
 @_to_the_end.def_vmap
 def _of_a_batch(count: int, in_batched, *batch) -> tuple[_Followed, _Followed]:
-    """Follow the samples of a batch together for the first step, then one after the other, since each takes
-    its own number of steps.
+    """Follow all samples of a batch together in the first step, then one after the other, because the number
+    of further steps differs between samples.
     """
     own = jax.tree.unflatten(jax.tree.structure(batch), jax.tree.leaves(in_batched))
     whole = lambda x, own: x if own else jnp.broadcast_to(x, (count, *jnp.shape(x)))
@@ -251,26 +253,26 @@ def _of_a_batch(count: int, in_batched, *batch) -> tuple[_Followed, _Followed]:
 
 @shown_from_users_lines
 def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint") -> CriticalPoint:
-    """Return a special point of a family as a function of the scene's parameters: where a mode crosses the
-    imaginary axis, or two modes coincide.
+    """Return a special point of a family as a function of the scene's parameters: a point where an eigenvalue
+    crosses the imaginary axis, or where two eigenvalues coincide.
 
         straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3})
         jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(0.08)
 
     **Arguments**
 
-    - `scene`: of the same class as the family's scene. Its parameters may be traced, and may differ from the
-      family's: the point is followed from the family's parameters to the given ones.
-    - `motions`: the family, with its inputs.
-    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. Of several such
-      points, the one nearest to the family's guess is taken.
+    - `scene`: a scene of the family's class. Its parameters may be traced and may differ from the family's;
+      the point is followed from the family's parameters to the given ones.
+    - `motions`: the family, whose inputs are used.
+    - `what`: the name of a mode, a kind of point ("double root"), or one of the family's `changes`. If
+      several points match, the one nearest to the family's guess is taken.
 
-    **Returns** a `CriticalPoint`. It is twice differentiable, by the implicit function theorem, and works
-    under `jit` and `vmap`. If the point does not exist for these parameters, or is no smooth function of
-    them, its numbers and their derivatives are NaN, and `code` is not 0.
+    **Returns** a `CriticalPoint`. It is twice differentiable, by the implicit function theorem, also under
+    `jit` and `vmap`. If the point does not exist for these parameters, or is not a smooth function of them,
+    its numbers and their derivatives are NaN, and `code` is not 0.
 
-    **Raises** ValueError if the family has no such point, or only as a fold or branch point; for a scene of
-    another class; and for float32.
+    **Raises** ValueError if the family has no such point, or only as a fold or branch point; if the scene is
+    of another class; and in float32.
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
@@ -318,8 +320,8 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
             raise ValueError(
-                f"the steady motions of these parameters form a set of {freedoms.shape[1]} dimensions, where "
-                "a zero eigenvalue is no special point; name further values in `held`"
+                f"the steady motions for these parameters form a set of {freedoms.shape[1]} dimensions, "
+                "where a zero eigenvalue is not a special point; name further values in `held`"
             )
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]

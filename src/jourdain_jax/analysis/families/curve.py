@@ -1,5 +1,5 @@
-"""Curves of solutions by pseudo-arclength (H. B. Keller, 1977), which follow an unknown past its turning
-points.
+"""Follow curves of solutions by pseudo-arclength continuation (H. B. Keller, 1977), which can pass turning
+points of an unknown.
 
     R(z) = 0,   t.(z - z_i) = s        t: unit tangent at z_i, J t = 0;   s: distance along it
 
@@ -17,21 +17,21 @@ from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_match
 from jourdain_jax.calculus.reals import all_finite, largest
 from jourdain_jax.scene.parameter_fields import parameters_of
 
-Targets = list[tuple[int, float]]  # indices of unknowns, and values at which a curve ends
+Targets = list[tuple[int, float]]  # indices of unknowns, and their values at which a curve ends
 CLOSED = "the curve is closed"
-# steps, in sizes of the unknowns; far from the origin the longest is relative to the distance
+# length of steps, in units of the unknowns' sizes; far from the origin LONGEST is relative to the distance
 LONGEST, SHORTEST = 0.1, 1e-8
 
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a curve, the equations and the tangent there."""
+    """Point of a curve, with the tangent and the equations there."""
 
     z: Vector
     tangent: Vector
     look: Look
-    modes: Modes  # eigenvalues of small motions, in the columns of the previous points
-    hardness: int = 0  # number of corrections
+    modes: Modes  # eigenvalues of small motions, in the same order as at the previous points
+    hardness: int = 0  # number of corrections by Newton's method
 
 
 def solved(
@@ -42,8 +42,8 @@ def solved(
     most: int = 8,
     longest: float = np.inf,
 ) -> tuple[Vector, Look, int] | None:
-    """Return z with R = 0 and `rows z = targets`, the equations there, and the number of corrections; None if
-    Newton's method does not converge.
+    """Solve R = 0 and `rows z = targets` by Newton's method. Return z, the equations there, and the number of
+    corrections; None if the method does not converge.
     """
     for k in range(most):
         look = equations(z)
@@ -52,7 +52,7 @@ def solved(
         step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[
             0
         ]
-        # of R: near a branch point it leads to large steps
+        # round-off of R, which causes large steps near a branch point
         noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))
         z = z + step * min(1.0, longest / max(largest(step), 1e-300))
         if largest(step) < 1e-11 * (1 + largest(z)) or largest(look.R) < noise:
@@ -63,8 +63,8 @@ def solved(
 def along(
     equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True
 ) -> Point | None:
-    """Return the point of the curve at a given distance along the tangent of another point; None if none is
-    found. Unless `with_modes`, the modes of that point are copied.
+    """Return the point of the curve at the distance s along the tangent of `point`; None if it is not found.
+    Unless `with_modes`, it gets the modes of `point`.
     """
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
@@ -78,11 +78,10 @@ def along(
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
-    """Return the points of a curve from its start on, and the reason why it ends: a target, its start, or a
-    failed search.
+    """Return the points of a curve from its start on, and the reason why it ends.
 
-    A step is halved if the curve turns sharply there, if many corrections are needed, or if eigenvalues move
-    so far that they cannot be matched.
+    A step is halved if the curve turns sharply, if many corrections are needed, or if eigenvalues change so
+    much that they cannot be matched.
     """
     points, step, easy = [start], LONGEST / 10, 3
     while len(points) < most:
@@ -120,8 +119,8 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Return the reason why a curve ends before a point, if a parameter has the wrong sign there; otherwise
-    None.
+    """Return why a curve ends before a point: a parameter would have the wrong sign there. None if it would
+    not.
     """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):
@@ -141,13 +140,13 @@ def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point |
     there = along(equations, here, step)
     if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
         return None
-    # coinciding ones are matched in any order
+    # after very short steps, nearly equal eigenvalues may be matched in any order
     sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)
     return there if sure else None
 
 
 def _closed(equations: Motions, first: Point, here: Point, there: Point) -> bool:
-    """Return whether a step passes the start of the curve."""
+    """Return whether a step passes the start of the curve, so that the curve is closed."""
     s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
     if not (0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step):
         return False
@@ -163,18 +162,18 @@ def reversed_at(point: Point) -> Point:
 def located(
     equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False
 ) -> Point | None:
-    """Return the point between two neighbours at which a smooth `test` changes its sign; None if the curve is
-    lost or undefined.
+    """Return the point between two neighbours at which a smooth `test` changes its sign; None if the curve
+    cannot be followed or the equations are undefined.
 
-    The interval is divided repeatedly, and a short interval is interpolated linearly. It is not divided in
-    the middle, where by symmetry branch points often lie: there the equations lose rank.
+    The interval is divided repeatedly and finally interpolated linearly. It is not divided in the middle: by
+    symmetry, branch points, where the equations lose rank, often lie there.
     """
     share, short = 0.4, 1e-6  # a piece this short differs from its chord by the square of its length
     (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there
     at_a, at_b = test(low), test(high)
     while b - a > short:
         c = a + share * (b - a)
-        # a better guess than the tangent, since another branch may be close
+        # the chord is a better guess than the tangent, because another branch may be close
         middle = along(equations, here, c, low.z + share * (high.z - low.z), with_modes)
         if middle is None:
             return None

@@ -1,4 +1,4 @@
-"""Derivatives of one eigenvalue of small motions with respect to all parameters.
+"""Compute derivatives of one eigenvalue of small motions with respect to all parameters.
 
     ds = y' dF x,    F x = s x,  y' F = s y',  y' x = 1
 
@@ -25,8 +25,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Sensitivities(Printed, eqx.Module):
-    """Derivatives of one eigenvalue with respect to every parameter; `found["c"]` is one of them. They
-    include the effect of the change of the steady motion.
+    """Derivatives of one eigenvalue with respect to all parameters, by name: `found["c"]`. They include the
+    effect of the change of the steady motion.
     """
 
     mode: str = static()
@@ -34,7 +34,7 @@ class Sensitivities(Printed, eqx.Module):
     condition: float  # |y' x| of unit left and right vectors: zero at a double root, which has no derivative
     by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
     code: int
-    held: Labels = static()  # quantities that identify the motion and keep their values
+    held: Labels = static()  # quantities that keep their values and so identify the steady motion
 
     def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
         """Return the derivative with respect to a parameter."""
@@ -57,8 +57,8 @@ class Sensitivities(Printed, eqx.Module):
 def sensitivities(
     small: tuple[Scene, State, Array], mode: str, s: complex, held: str | Labels
 ) -> Sensitivities:
-    """Return derivatives of the eigenvalue s of small motions about a steady state with respect to all
-    parameters, by two reverse passes.
+    """Return the derivatives of the eigenvalue s of small motions about a steady state with respect to all
+    parameters. Two reverse passes compute them.
     """
     scene, state, f = small
     equations = SteadyEquations(
@@ -69,7 +69,7 @@ def sensitivities(
     if not largest(look.R) < 1e-6:
         raise ValueError(
             f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no "
-            "derivatives; find a steady one by `jj.steady`"
+            "derivatives; find a steady motion with `jj.steady`"
         )
     fixed = _held(equations, look, as_names(held))
     (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
@@ -109,8 +109,8 @@ def sensitivities(
 
 
 def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
-    """Return the unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise
-    speeds in their order, then coordinates.
+    """Return the indices of unknowns that distinguish a steady motion from its neighbours: the named ones, or
+    else the first suitable speeds, then coordinates, in their order.
     """
     beside = null_space(look.J)
     count, speeds = beside.shape[1], equations.scene.speed_names.entries

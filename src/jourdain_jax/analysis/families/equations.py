@@ -1,10 +1,10 @@
-"""Equations of steady motions as one scalar program, with their derivatives.
+"""Equations of steady motions and their derivatives, as one scalar program.
 
     R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates, speeds, varying parameters
 
-y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which none
-of these depend, such as a heading, are omitted. Unknowns are measured in units of their size, rows in SI
-units. Small motions about a steady one:
+y: the independent speeds of the scalar program; j: the coordinates that must be constant. Coordinates on
+which no equation depends, such as a heading, are omitted. Unknowns are in units of their sizes, rows in SI
+units. Small motions about a steady motion:
 
     x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: basis of C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
 """
@@ -31,25 +31,25 @@ PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double ro
 
 @dataclass(frozen=True)
 class Look:
-    """The equations at one point, in units of rows and unknowns."""
+    """Equations at one point. Rows are in SI units, unknowns in units of their sizes."""
 
-    R: Float[np.ndarray, "rows"]  # rows of held values are the last
+    R: Float[np.ndarray, "rows"]  # the last rows are those of held values
     J: Float[np.ndarray, "rows unknowns"]
-    # data of small motions: F of (q, y), SI units, and C, rows that vanish for (dq, dy); or multipliers
+    # small motions: F and C for (q, y) in SI units, or the multipliers of a periodic motion
     small: tuple[np.ndarray, ...]
 
 
 class Motions(ABC):
-    """Equations of a kind of motions, whose solutions form families."""
+    """Equations of one kind of motion, steady or periodic, whose solutions form families."""
 
-    what: str  # name of these motions
-    modes: str  # name and unit of the numbers that describe small motions
+    what: str  # name of this kind of motion
+    modes: str  # name and unit of eigenvalues or multipliers
     growth: Callable[[np.ndarray], np.ndarray]  # growth of modes
-    crossing: Callable[[complex], str]  # kind of point at which a mode starts or ceases to grow
+    crossing: Callable[[complex], str]  # kind of point at which a mode starts or stops growing
     t: Scalar  # s, at the start
     scene: Scene
     vary: Labels  # parameters among the unknowns
-    given: np.ndarray  # all numbers, with the unknowns at the guess
+    given: np.ndarray  # all numbers (parameters, t, q, u, inputs) of the guess
     by_name: dict[str, int]  # indices of coordinates, speeds and varying quantities
     places: Int[np.ndarray, "unknowns"]  # indices of the unknowns
     unknowns: Labels
@@ -58,7 +58,7 @@ class Motions(ABC):
     held: Int[np.ndarray, "held"]  # indices of unknowns that keep their initial values
 
     def index(self, name: str) -> int:
-        """Return the index of an unknown. Raises ValueError, with the nearest names, if there is none."""
+        """Return the index of the unknown `name`. Raises ValueError, with similar names, if there is none."""
         check_name(
             name,
             self.unknowns,
@@ -67,7 +67,7 @@ class Motions(ABC):
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:
-        """Return all numbers, with the unknowns from z."""
+        """Return all numbers, those of the unknowns taken from z."""
         given = self.given.copy()
         given[self.places] = z * self.size
         return given
@@ -78,7 +78,7 @@ class Motions(ABC):
         return {name: float(numbers[k]) for name, k in self.by_name.items()}
 
     def place(self, point) -> Vector:
-        """Return z for given values of the unknowns by name."""
+        """Return z for the values of the unknowns in `point`, by name."""
         return np.array([point[name] for name in self.unknowns]) / self.size
 
     @abstractmethod
@@ -87,12 +87,12 @@ class Motions(ABC):
 
     @abstractmethod
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Return the eigenvalues or multipliers of small motions, in any order, without the zeros of motion
-        along the family.
+        """Return the eigenvalues or multipliers of small motions, in any order. Perturbations along the
+        family are excluded.
         """
 
     def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
-        """Return the equations, with a row for each unknown that keeps its value."""
+        """Return the equations, with an additional row for each unknown that keeps its value."""
         if not len(self.held):
             return Look(R, J * self.size, small)
         return Look(
@@ -103,7 +103,7 @@ class Motions(ABC):
 
 
 class SteadyEquations(Motions):
-    """R, J, F and C of one scene as functions of z; `held` unknowns keep their values at the guess."""
+    """R, J, F and C of one scene as functions of z. The `held` unknowns keep their values at the guess."""
 
     what, modes = "steady motions", "eigenvalues, 1/s"
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
@@ -152,8 +152,8 @@ class SteadyEquations(Motions):
         return self.with_held(v[self.rows], J, z, (F, C))
 
     def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
-        """Return the directions of (q, y) along which there are further steady motions with the same
-        parameters, as columns in SI units.
+        """Return the directions of (q, y) along which other steady motions exist for the same parameters, as
+        columns in SI units.
         """
         count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
         return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
@@ -164,11 +164,11 @@ class SteadyEquations(Motions):
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Return eigenvalues of small motions in 1/s, by ascending real part, without the zeros of motion
-        along the family or of held quantities.
+        """Return the eigenvalues of small motions (1/s), by ascending real part, without the zero eigenvalues
+        of perturbations towards other steady motions.
 
-        The directions T lead to further steady motions and have zero eigenvalues. The other eigenvalues are
-        the eigenvalues of P' A P, where the columns of P are orthonormal and perpendicular to T.
+        The columns of T are the directions of other steady motions for the same parameters. The returned
+        eigenvalues are those of P' A P, where the columns of P are orthonormal and perpendicular to T.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
         F, C = look.small
@@ -178,7 +178,7 @@ class SteadyEquations(Motions):
         return values[np.lexsort((-values.imag, values.real))]
 
     def split(self, numbers):
-        """Return q, u and varying quantities, by name."""
+        """Return q, u, and the varying quantities by name."""
         first, n, m = self.instant.states
         return (
             numbers[first : first + n],
@@ -196,8 +196,8 @@ def numbered(scene: Scene) -> Scene:
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Return the sizes of some coordinates (from their domain) and of all speeds, used as units of the
-    unknowns.
+    """Return the sizes of the coordinates `kept` (from their domain) and of all speeds. Sizes are the units
+    of the unknowns.
     """
     low, high = coordinate_bounds(scene)
     of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]

@@ -1,4 +1,4 @@
-"""Families of steady and of periodic motions: the curve through one of them, with its special points."""
+"""Families of steady or periodic motions: the curve through a given motion, with its special points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,20 +31,20 @@ from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
 
-SHOWN = 1e-9  # changes in sizes of an unknown above which it is printed
+SHOWN = 1e-9  # an unknown is printed if its change, in units of its size, exceeds this number
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class FamilyPoint(Printed):
-    """A point of a family; `point["lean"]`, `point.state`. `kind` names a special point."""
+    """Point of a family: `point["lean"]`, `point.state`. `kind` is empty unless the point is special."""
 
     kind: str
     state: State
-    eigenvalues: Modes  # 1/s, in the columns of the family; multipliers of a periodic motion
-    modes: Labels  # names of the modes concerned
-    values: dict[str, float]  # of coordinates, speeds, and the parameter that varies
+    eigenvalues: Modes  # 1/s, in the order of the family's modes; of a periodic motion: multipliers
+    modes: Labels  # names of the modes that cross or coincide here
+    values: dict[str, float]  # coordinates, speeds, and the parameter that varies
     tangent: Vector  # of the curve, along its unknowns
-    about: str  # name of the eigenvalues
+    about: str  # name and unit of `eigenvalues`
 
     def __getitem__(self, name: str) -> float:
         """Return a coordinate, a speed, or the parameter that varies."""
@@ -52,7 +52,9 @@ class FamilyPoint(Printed):
 
     @property
     def differentiable(self) -> bool:
-        """Return whether the point is a smooth function of the scene's parameters: no branch point."""
+        """Return whether the point is a smooth function of the scene's parameters, as all but branch points
+        are.
+        """
         return self.kind != "branch point"
 
     def _text(self) -> str:
@@ -65,11 +67,11 @@ class FamilyPoint(Printed):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Family(Printed):
-    """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
+    """Steady or periodic motions along a curve, in order: `family["lean"]`, `print(family)`. Values of a
     periodic motion are those at the start of a period.
 
-    Each eigenvalue keeps its column along the curve. Zeros of motion along the family or of held quantities
-    are omitted. Periodic motions have multipliers instead of eigenvalues.
+    Each column of `eigenvalues` follows one mode along the curve. Zero eigenvalues due to neighbouring steady
+    motions are omitted. Periodic motions have multipliers instead of eigenvalues.
     """
 
     equations: Motions
@@ -82,7 +84,7 @@ class Family(Printed):
         return len(self.points)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
-        """Return values of a coordinate, a speed, or the parameter that varies, at all points."""
+        """Return the values of a coordinate, a speed, or the parameter that varies, at all points."""
         check_name(
             name,
             self.equations.by_name,
@@ -93,8 +95,8 @@ class Family(Printed):
 
     @property
     def eigenvalues(self) -> Complex[np.ndarray, "points modes"]:
-        """Return eigenvalues of small motions in 1/s, or multipliers, each in its column, named by
-        `mode_names`.
+        """Return the eigenvalues of small motions (1/s), or the multipliers, at all points. Columns are named
+        by `mode_names`.
         """
         return np.array([point.modes for point in self.points])
 
@@ -107,24 +109,26 @@ class Family(Printed):
 
     @property
     def folds(self) -> tuple[FamilyPoint, ...]:
-        """Return points at which a named value turns back."""
+        """Return the points at which a named quantity turns back along the curve."""
         return tuple(point for point in self.special if point.kind.startswith("fold"))
 
     @property
     def branches(self) -> tuple[FamilyPoint, ...]:
-        """Return points where another family crosses: `jj.family(scene, family.branches[0])` follows it."""
+        """Return the points at which another family crosses. `jj.family(scene, family.branches[0])` follows
+        it.
+        """
         return tuple(point for point in self.special if point.kind == "branch point")
 
     @property
     def changes(self) -> tuple[FamilyPoint, ...]:
-        """Return points at which an eigenvalue passes zero, a pair passes the imaginary axis, or two
-        eigenvalues coincide. For multipliers: points at which one passes 1 or -1, or a pair passes the unit
-        circle.
+        """Return the points at which an eigenvalue passes zero, a pair crosses the imaginary axis, or two
+        eigenvalues coincide. For multipliers: the points at which one passes 1 or -1, a pair crosses the unit
+        circle, or two coincide.
         """
         return tuple(point for point in self.special if point.modes)
 
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
-        """Return every point of the curve at which a coordinate, speed or parameter has this value:
+        """Return all points of the curve at which a coordinate, speed or parameter has a given value, as in
         `family.at(lean=0.4)`.
         """
         if len(named) != 1:
@@ -143,7 +147,7 @@ class Family(Printed):
         return tuple(self.point(point) for point in (*exact, *found) if point)
 
     def point(self, point: Point, kind: str = "", columns: Indices = ()) -> FamilyPoint:
-        """Return a point of the curve with its state and eigenvalues."""
+        """Return a point of the curve as a `FamilyPoint`. `columns`: indices of its `modes`."""
         known = self.equations
         values = known.values(point.z)
         entries = (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
@@ -153,9 +157,7 @@ class Family(Printed):
         return FamilyPoint(kind, state, point.modes, modes, values, tangent, known.modes)
 
     def to_xarray(self):
-        """Return points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their
-        names.
-        """
+        """Return all points as an `xarray.Dataset`: unknowns, `stable`, and eigenvalues with mode names."""
         xarray = needed("xarray", "a family as labelled arrays")
         values = {name: ("point", self[name]) for name in self.equations.unknowns}
         about = dict(zip(("long_name", "units"), self.equations.modes.split(", "), strict=False))
@@ -221,8 +223,8 @@ def family(
     inputs: Numbers | dict | None = None,
     max_points: int = 4000,
 ) -> Family:
-    """Return the family of steady motions through the motion near a guess, or a family of periodic motions.
-    Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`, with one freedom left.
+    """Return the family of steady motions through the steady motion near a guess, or a family of periodic
+    motions. Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`; one freedom remains.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
         print(turns)    # folds, branch points, changes of stability, why the curve ends
@@ -233,29 +235,30 @@ def family(
 
     **Arguments**
 
-    - `guess`: as in `steady`; or a branch point of another family of steady motions, to follow the other
-      curve through it; or a `PeriodicMotion` of this class of scenes, with the inputs, the event and the held
-      quantities of its search.
-    - `until`: name -> value at which the curve ends. The curve starts at the guess, keeps the guess's value
-      of that name there, and is followed towards the given value; without `until` it is followed in both
-      directions. A closed curve ends at its start, and a curve along a parameter ends before the parameter
-      loses its declared sign.
-    - `vary`: a parameter of the scene (one number) that changes along the curve.
-    - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as in `steady`.
-    - `names`: of the modes at the start, by ascending real part, with the positive imaginary part of a pair
-      first; default: the scene's `mode_names` at the point farthest out (for a bicycle the fastest), or "mode
-      1", ...
+    - `guess`: one of: a guess of a steady motion, as in `steady`; a branch point of another family, whose
+      other curve is then followed; a `PeriodicMotion` of a scene of this class, whose inputs, event and held
+      quantities are then used.
+    - `until`: a name and the value of it at which the curve ends. At its start, the curve has the value of
+      the guess; it is followed towards the given value. Without `until` it is followed in both directions. A
+      closed curve ends at its start. A curve along a parameter ends before the parameter loses its declared
+      sign.
+    - `vary`: a scalar parameter of the scene that changes along the curve.
+    - `held`: names of coordinates and speeds that keep the value of the guess; `inputs`: as in `steady`.
+    - `names`: names of the modes at the start, by ascending real part of the eigenvalue; of a pair, the one
+      with the positive imaginary part comes first. Default: the scene's `mode_names` at the point farthest
+      from zero (for a bicycle the fastest), or "mode 1", ...
     - `max_points`: the largest number of points in each direction.
 
-    **Returns** a `Family`, traced by pseudo-arclength, with special points accurate to round-off. Steps turn
-    by at most 10 degrees and are at most 0.1 of the sizes of the unknowns. The size of a coordinate is the
-    width of its domain, the size of a speed 10 SI units. Two special points of one kind within one step are
-    found only if the test function is nearly a parabola between them, as 1 mm apart on a curve of 1 m.
+    **Returns** a `Family`, computed by pseudo-arclength continuation. Its special points are accurate to
+    round-off. Steps turn by at most 10 degrees and are at most 0.1 of the sizes of the unknowns. The size of
+    a coordinate is the width of its domain, the size of a speed is 10 SI units. Two special points of the
+    same kind within one step are found only if the test function is nearly a parabola between them, for
+    example if they are 1 mm apart on a curve of 1 m.
 
-    **Raises** ValueError for an unknown name; if no steady motion is near the guess; for none or several
-    freedoms (the error names quantities to hold); and for a start at a branch point. Raises `NotLowered` if
-    the scene has no scalar program, and `DifferentiationModeError` inside `jit`: differentiate `steady` or
-    `linearize`.
+    **Raises** ValueError for an unknown name, if no steady motion is near the guess, if no freedom or several
+    freedoms remain (the error names quantities to hold), and for a start at a branch point; `NotLowered` if
+    the scene has no scalar program; `DifferentiationModeError` inside `jit` (differentiate `steady` or
+    `linearize` instead).
     """
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
@@ -299,7 +302,7 @@ def family(
             "family with the same unknowns"
         )
     points, ends = followed(equations, begin, targets, max_points)
-    # a branch point between its neighbours is found like any other
+    # the start at a branch point is omitted, so that it is found between its neighbours like any other
     labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)
     found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, labels)
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}

@@ -1,4 +1,4 @@
-"""Equations of multiple shooting (R in `periodic.py`) with their derivatives and multipliers."""
+"""Equations of multiple shooting (R in `periodic.py`), with derivatives and multipliers."""
 
 import equinox as eqx
 import jax
@@ -25,29 +25,29 @@ States = Float[Array, "states"]
 
 
 class Shooting(eqx.Module):
-    """R and its derivatives as functions of the period and of the states at the starts of pieces, shape
-    (pieces, states).
+    """R and its derivatives as functions of the unknowns: the states at the starts of the pieces, shape
+    (pieces, states), and the period.
     """
 
     scene: Scene
     inputs: Inputs
     options: AllOptions
-    shift: States  # change per period, as given
+    shift: States  # given change per period
     instant: ByProgram | ByMatrices = static()
     pieces: int = static()
-    until: int | None = static()
-    kept: Indices = static()  # indices of relevant entries of z
-    free: Indices = static()  # indices of unknown entries at the start
+    until: int | None = static()  # index of the event c; None if the period is known
+    kept: Indices = static()  # indices of the entries of z that must be periodic
+    free: Indices = static()  # indices of the unknown entries of z at the start
     shifted: Labels = static()  # names of coordinates with a given shift
 
     @property
     def sizes(self) -> Float[np.ndarray, "states"]:
-        """Return sizes of coordinates and speeds."""
+        """Return the sizes of coordinates and speeds."""
         return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
 
     @property
     def is_unknown(self) -> Bool[np.ndarray, "all_unknowns"]:
-        """Return which numbers of the states at the starts of pieces, and whether the period, are unknown."""
+        """Return which entries of the states at the starts of the pieces, and of the period, are unknown."""
         at_start = [k in self.free for k in range(len(self.sizes))]
         return np.array([*at_start, *[True] * len(self.sizes) * (self.pieces - 1), self.until is not None])
 
@@ -64,13 +64,13 @@ class Shooting(eqx.Module):
         ).nan_if_failed()
 
     def moved(self, k, z: States, t, period) -> States:
-        """Return f_k."""
+        """Return f_k, the state at the end of piece k."""
         part = period / self.pieces
         motion = self.motion(t + k * part, z, (t + (k + 1) * part)[None])
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     def events(self, t, z: States) -> Float[Array, "events"]:
-        """Return values of the stop events, c among them."""
+        """Return the values of all events, including c."""
         return event_values(self.scene, motion_at(self.scene, t, *self.split(z), inputs_at(self.inputs, t)))
 
     def constraints(self, t, z: States) -> tuple[Array, Array]:
@@ -81,7 +81,7 @@ class Shooting(eqx.Module):
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
     def aligned(self, there: States, here: States) -> States:
-        """Return the state `there`, with the signs of its quaternions chosen to be nearest to `here`."""
+        """Return the state `there`, with each quaternion's sign chosen so that it is nearest to `here`."""
         for first, _ in self.scene.coordinates.quaternions:
             part = slice(first, first + 4)
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
@@ -133,7 +133,7 @@ class Shooting(eqx.Module):
         self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends
     ) -> Complex[Array, "multipliers"]:
         """Return the eigenvalues of the product M_n .. M_1, largest first, from df_k/dz_k and f_k. If the
-        period is unknown, the eigenvalue of motion along the orbit is omitted.
+        period is unknown, the eigenvalue 1 of the perturbation along the orbit is omitted.
         """
         zs, period = self.pieces_of(x)
         kept = np.array(self.kept)
@@ -152,7 +152,7 @@ class Shooting(eqx.Module):
         M = jnp.linalg.solve(L @ following, L @ D @ B)
         cyclic = jnp.zeros((n, count, n, count), M.dtype).at[(np.arange(n) + 1) % n, :, np.arange(n)].set(M)
         roots = jnp.linalg.eigvals(jnp.reshape(cyclic, (n * count, -1)))
-        # of the n roots of one multiplier, one lies in this sector; its bounds contain no real multiplier
+        # of the n roots of a multiplier, exactly one lies in this sector, whose bounds avoid real multipliers
         beyond = jnp.mod(jnp.angle(roots) - 0.1, 2 * np.pi) >= 2 * np.pi / n
         found = (roots**n)[jnp.argsort(beyond, stable=True)[:count]]
         found = jnp.where(jnp.abs(found.imag) < 1e-9 * jnp.abs(found), found.real, found)

@@ -1,19 +1,19 @@
-"""Periodic motions by multiple shooting over one period, and their Floquet multipliers.
+"""Find periodic motions by multiple shooting over one period, and their Floquet multipliers.
 
     z_k -> f_k(z_k),  k = 1 .. n:  motions over equal parts of the period T,   z = (q, u)
     R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  K (f_n(z_n) - z_1),  c(z_1) )
 
-g, phi: constraints; K: omits coordinates without effect on accelerations; c: value of an event, if T is
-unknown. Ignorable coordinates may shift by the same amount in every period. With small motions dz_k = B_k x_k
-that satisfy the constraints, and L_k B_k = 1,
+g, phi: constraints; K: selects the entries of z other than ignorable coordinates; c: value of an event, if T
+is unknown. Ignorable coordinates may shift by the same amount in every period. With small motions dz_k = B_k
+x_k that satisfy the constraints, and L_k B_k = 1,
 
     x_{k+1} = M_k x_k,  M_k = L_{k+1} (df_k/dz_k) B_k:       the multipliers are the eigenvalues of M_n .. M_1
 
-They are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k, so that small multipliers keep
-their digits beside large ones. R has redundant, consistent rows; the pseudo-inverse of its Jacobian at the
-root carries derivatives with respect to parameters. Source: R. Seydel, Practical Bifurcation and Stability
-Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and A. D. Jepson, SIAM J. Numer.
-Anal. 28 (1991) 1446.
+The multipliers are computed as n-th powers of the eigenvalues of the cyclic matrix with the blocks M_k, so
+that small multipliers keep their digits beside large ones. R has redundant but consistent rows. Derivatives
+with respect to parameters use the pseudo-inverse of its Jacobian at the root. Source: R. Seydel, Practical
+Bifurcation and Stability Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and A. D.
+Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
 """
 
 from collections.abc import Mapping
@@ -58,19 +58,20 @@ from jourdain_jax.structure.structure import structure_of
 
 
 class PeriodicMotion(Printed, eqx.Module):
-    """A motion that repeats itself after each period; `orbit["yaw_rate"]` is a value at its start.
+    """Motion that repeats itself after each period. `orbit["yaw_rate"]` is the value at the start of a
+    period.
 
-    `jj.simulate(scene, orbit.state, t1=orbit.period)` is the motion itself.
+    `jj.simulate(scene, orbit.state, t1=orbit.period)` computes the motion.
     """
 
     state: State  # at the start of a period
     period: Scalar  # s
-    shift: dict[str, Scalar]  # change of a coordinate per period: ignorable coordinates, and those given
-    multipliers: Complex[Array, "multipliers"]  # growth of small motions per period, the largest first
-    residual: Scalar  # largest difference after one period, in units of the unknowns' sizes
+    shift: dict[str, Scalar]  # change per period of ignorable coordinates and of those with a given shift
+    multipliers: Complex[Array, "multipliers"]  # growth of small motions per period, largest first
+    residual: Scalar  # largest residual of the equations, in units of the unknowns' sizes
     converged: Flag
-    by: "Shooting"  # the equations solved
-    unknowns: Unknowns  # states at the starts of pieces, and the period
+    by: "Shooting"  # the equations
+    unknowns: Unknowns  # states at the starts of the pieces, and the period
 
     def __getitem__(self, name: str) -> Scalar:
         """Return a coordinate or speed at the start, by name."""
@@ -78,8 +79,8 @@ class PeriodicMotion(Printed, eqx.Module):
 
     @property
     def stable(self) -> Flag:
-        """Return whether no small motion grows. Multipliers of symmetries and conserved quantities are one,
-        up to round-off.
+        """Return whether no small motion grows. Multipliers that belong to symmetries and conserved
+        quantities equal one up to round-off, and count as not growing.
         """
         return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
 
@@ -132,22 +133,23 @@ def periodic(
 
     **Arguments**
 
-    - `guess`: a `State`, or named values (a start, as for `simulate`), of a state near the motion.
-    - `period`: in s. It is kept, and must equal the period of the loads or inputs, unless `until` is given;
-      then a rough value is enough.
-    - `until`: the name of an event of the scene whose value is zero at the start and end of a period; the
+    - `guess`: a state near the motion: a `State`, or named values as for `simulate`.
+    - `period`: the period in s. Without `until` it is fixed, and must be the period of the loads or inputs.
+      With `until`, a rough value is enough.
+    - `until`: the name of an event of the scene whose value is zero at the start and end of a period. The
       period is then found as well. Nothing in the scene may depend on time.
-    - `held`: names of coordinates and speeds that keep the guess's value at the start, needed if there are
-      neighbouring periodic motions.
-    - `shift`: name -> change of a coordinate per period, `{"crank": 2 * jnp.pi}` for a rotating crank.
-    - `pieces`: number of equal parts of the period, integrated as a batch. Increase it if disturbances grow
-      by more than 1e3 in a part.
+    - `held`: names of coordinates and speeds that keep the value of the guess at the start. It is needed if
+      there are neighbouring periodic motions.
+    - `shift`: changes of coordinates per period by name, such as `{"crank": 2 * jnp.pi}` for a rotating
+      crank.
+    - `pieces`: number of equal parts of the period, which are integrated as a batch. Increase it if
+      disturbances grow by more than 1e3 in a part.
     - `options`, `by_name`: as in `simulate`, including `inputs`; the default tolerance is 1e-12.
 
-    **Returns** a `PeriodicMotion`. Check `converged` and `residual`, since a failed search raises no error.
-    Stop events do not end the motion, but a motion that passes one, sampled at 100 times in the period,
-    counts as not found. Runs under `jit` and `vmap`; differentiable in the parameters of the scene where the
-    motion is a smooth function of them and its multipliers are distinct.
+    **Returns** a `PeriodicMotion`. Check `converged` and `residual`, because a failed search raises no error.
+    Stop events do not end the motion. However, a motion whose events, sampled at 100 times in the period,
+    become negative does not count as converged. Runs under `jit` and `vmap`. Differentiable with respect to
+    the scene's parameters where the motion is a smooth function of them and its multipliers are distinct.
 
     **Raises** ValueError for an unknown name or a period that is not positive; TypeError for unknown options.
     """
@@ -162,7 +164,7 @@ def periodic(
         dict.fromkeys((*SPAN, "events", "work", "retry"), beside),
         built,
     )
-    # tolerances are traced below
+    # the solver is chosen here, because tolerances are traced below
     options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)
     period = checked_real(period, "`period`", (), advice="give a time in s")
     if not np.all(known_numbers(period) > 0) or not all_finite(known_numbers(period)):
@@ -224,7 +226,7 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R, its derivatives and the multipliers of one scene as functions of z, the unknowns of a periodic
+    """R, its derivatives and the multipliers of one scene as functions of z: the unknowns of a periodic
     motion and one varying parameter.
     """
 

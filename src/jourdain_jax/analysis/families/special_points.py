@@ -1,13 +1,13 @@
-"""Special points between two neighbours of a curve, where a smooth test function changes its sign.
+"""Detect special points between two neighbouring points of a curve: a smooth test function changes its sign.
 
     fold of a named unknown     t_k = 0                       t: tangent
     branch point                det (U'J; t) = 0              U: the independent rows of J, continued
     zero eigenvalue             s = 0, real
     pair on the imaginary axis  Re s = 0, complex
-    double root                 (s_a - s_b)^2 = 0             two real ones become complex, or the reverse
+    double root                 (s_a - s_b)^2 = 0             two real eigenvalues become complex, or reverse
 
-If a test function keeps its sign but nearly vanishes by the parabola through three neighbours, it is
-evaluated there: it may change its sign twice within a step.
+A test function may change its sign twice within a step. Therefore, if it keeps its sign but the parabola
+through three neighbours nearly vanishes, it is evaluated there.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,13 +20,13 @@ from jourdain_jax.analysis.families.curve import Point
 from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import are_partners
 
-SURE = 1e-7  # relative to 1 + |s|: a larger real part, or distance of two eigenvalues, is not round-off
+SURE = 1e-7  # real parts and differences of eigenvalues above SURE (1 + |s|) are not round-off
 
 
 @dataclass(frozen=True)
 class Test:
-    """A test function that changes its sign at special points of one kind, and the magnitude above which its
-    value is reliable.
+    """Test function that changes its sign at special points of one kind. Above the magnitude `least`, its
+    sign is reliable.
     """
 
     kind: str
@@ -35,15 +35,17 @@ class Test:
     columns: tuple[int, ...] = ()  # of the eigenvalues concerned
 
     def changes(self, here: Point, there: Point) -> bool:
-        """Return whether it changes its sign between two neighbours."""
+        """Return whether the function changes its sign between two neighbours."""
         a, b = self.of(here), self.of(there)
         return a * b < 0 and min(abs(a), abs(b)) > self.least
 
 
 def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
-    """Return where a test function nearly vanishes without changing its sign; None if it changes its sign.
-    The position is found by a parabola through the values f at three neighbours, of which the second is at
-    zero.
+    """Return the position at which a test function nearly vanishes without changing its sign; None if there
+    is none.
+
+    The position is the minimum of the parabola through the values `f` at three neighbours. Positions `at` are
+    relative to the second neighbour.
     """
     (before, _, after), (a, b, c) = at, f
     if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
@@ -59,7 +61,7 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
-    """Yield the tests between two neighbouring points: for folds of the named unknowns, for branch points,
+    """Yield the tests between two neighbouring points: for branch points, for folds of the named unknowns,
     and for eigenvalues.
     """
     held = len(here.z) - 1
@@ -93,14 +95,14 @@ def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[
 
 
 def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
-    """Return unit tangents of the two curves that cross at a branch point: a and a' in its null space with l
-    . R_zz a a = 0.
+    """Return the unit tangents of the two curves that cross at a branch point: the vectors a in the null
+    space of J with l . R_zz a a = 0.
 
     R_zz is a central difference of J. Only one of the left null vectors l gives a nonzero quadratic form.
     """
     look = equations(z)
     U, _, V = np.linalg.svd(look.J)
-    left, null, h = U[:, look.J.shape[1] - 2 :], V[:-3:-1].T, 1e-4  # h: sizes of the unknowns
+    left, null, h = U[:, look.J.shape[1] - 2 :], V[:-3:-1].T, 1e-4  # h: in sizes of the unknowns
     of_a, of_b = ((equations(z + h * v).J - equations(z - h * v).J) @ null / (2 * h) for v in null.T)
     aa, ab, bb = np.linalg.svd(left.T @ np.column_stack([of_a, of_b[:, 1]]))[2][0]
     (low, high), axes = np.linalg.eigh([[aa, ab], [ab, bb]])

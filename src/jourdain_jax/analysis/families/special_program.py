@@ -1,4 +1,6 @@
-"""Equations of special points as one scalar program with derivatives; eigenvalue derivatives use it, too."""
+"""Equations of special points and their derivatives, as one scalar program. Eigenvalue derivatives use it,
+too.
+"""
 
 from functools import cached_property
 
@@ -14,8 +16,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 class SpecialProgram:
-    """Three quantities with their derivatives: R, the residual of `F (a b) = (a b) S`; C a; and C b. They are
-    functions of all numbers, a, b, and S (by rows).
+    """Program for R, the residual of `F (a b) = (a b) S`, C a and C b, and their derivatives. Arguments are
+    all numbers, a, b, and S by rows.
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
@@ -40,7 +42,9 @@ class SpecialProgram:
 
     @cached_property
     def of(self) -> Sloped:
-        """Return values of the equations with derivatives, from z, a, b and S."""
+        """Return the function that computes the equations and their derivatives with respect to z, a, b and
+        S.
+        """
         return Sloped(*self._sloped)
 
 

@@ -1,4 +1,4 @@
-"""Eigenvalues of small motions about the points of a family; a column follows one along the curve."""
+"""Match eigenvalues of small motions along a family, so that each column follows one mode."""
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -13,22 +13,22 @@ Modes = Complex[np.ndarray, "modes"]
 
 
 def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states free"]:
-    """Return an orthonormal basis of the x with C x = 0."""
+    """Return an orthonormal basis of the null space of C."""
     _, sigma, V = np.linalg.svd(C)
     return V[np.sum(sigma > 1e-9 * np.max(sigma, initial=1e-300)) :].T
 
 
 def matched(before: Modes, now: Modes) -> Modes:
-    """Return the eigenvalues, each in the column of its predecessor, by the assignment with the least
-    movement.
+    """Return the eigenvalues in the order of their predecessors: the assignment with the smallest total
+    change.
     """
     apart, place = np.abs(before[:, None] - now), np.arange(len(now))
     return now[optimize.linear_sum_assignment(apart - 1e-12 * (1 + largest(now)) * np.outer(place, place))[1]]
 
 
 def surely_matched(before: Modes, now: Modes) -> bool:
-    """Return whether every eigenvalue moved by less than half of its distance to the nearest other one,
-    excluding its complex partner.
+    """Return whether each eigenvalue moved by at most half of its distance to the nearest other eigenvalue.
+    Its complex conjugate does not count as another.
     """
     columns = range(len(now))
     beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
@@ -37,12 +37,12 @@ def surely_matched(before: Modes, now: Modes) -> bool:
 
 
 def are_partners(before, now, k: int, j: int) -> bool:
-    """Return whether two columns are a complex pair at one end at least."""
+    """Return whether two columns are a complex conjugate pair before or now."""
     return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
 
 
 def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
-    """Return names of the columns: the user's, the scene's, or numbers."""
+    """Return the names of the columns: `names` if given, otherwise the scene's, otherwise "mode 1", ..."""
     named = getattr(scene, "mode_names", None)
     names = (
         tuple(names)
@@ -50,7 +50,5 @@ def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
         else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
     )
     if len(names) != len(values):
-        raise ValueError(
-            f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes"
-        )
+        raise ValueError(f"`names` has {len(names)} names, expected one for each of the {len(values)} modes")
     return names

@@ -1,4 +1,4 @@
-"""Diagnostics of a motion: drifts, residuals, conditioning, contact forces, and their printed summary."""
+"""Diagnostics of a motion: drifts, residuals, conditioning, contact forces, and a printed summary."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,20 +20,18 @@ OverTimes = Float[Array, "*lanes times"]
 
 
 class Energies(eqx.Module):
-    """Energies along a motion, in J. `balance`, T + V less the integrated work, is constant for a correct
-    motion.
-    """
+    """Energies along a motion, in J. `balance` is constant for a correct motion."""
 
     kinetic: OverTimes
     potential: OverTimes
     work: OverTimes | None
-    lost: OverTimes | None = None  # in events so far; None without events at which a motion continues
+    lost: OverTimes | None = None  # in all earlier events; None if no event can continue the motion
 
     @property
     @with_nan_as_a_mark
     def balance(self) -> OverTimes:
-        """Return T - W + V + D: W is the work of forces without potential and of constraints that do work,
-        D the energy lost in events.
+        """Return T + V - W + D. W is the work of forces without a potential and of constraints that do work;
+        D is the energy lost in events.
         """
         return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (
             0.0 if self.work is None else self.work
@@ -67,12 +65,12 @@ class Diagnostics(eqx.Module):
 class ContactExtremes(eqx.Module):
     """Extreme forces of a rolling contact."""
 
-    lowest_normal: Scalar  # N; negative: it would have to pull
+    lowest_normal: Scalar  # N; negative: the contact would have to pull
     highest_normal: Scalar  # N
     friction_needed: Scalar  # largest |tangential| / normal
-    pulls: Array  # whether it would have to pull at any time, beyond round-off
+    pulls: Array  # whether the contact would have to pull at any time, beyond round-off
     determined: Array  # whether the constraints always determine these forces
-    normal_determined: Array  # whether they always determine the normal force
+    normal_determined: Array  # whether the constraints always determine the normal force
 
     @property
     def honest(self) -> bool:
@@ -81,10 +79,10 @@ class ContactExtremes(eqx.Module):
 
 
 def diagnose(trajectory: Record) -> Diagnostics:
-    """Return drifts, residuals, conditioning and contact extremes of one `trajectory` (for a batch:
-    `jax.vmap` or `rollout.lane(i)`).
+    """Return drifts, residuals, conditioning and extreme contact forces of one `trajectory`. For a batch use
+    `jax.vmap`, or pass `rollout.lane(i)`.
 
-    Unreached times are ignored. Raises ValueError for anything but a trajectory.
+    Unreached times are ignored. Raises ValueError if the argument is not a trajectory.
     """
     if not hasattr(trajectory, "scene"):
         raise ValueError(
@@ -105,7 +103,8 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
     return Diagnostics(
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind + (", changed by work that was not integrated" if lacks_work else ""),
-        # plus a share of the whole energy: if less than that varies, as at rest, no drift is reported
+        # plus a small share of the whole energy, so that no drift is reported if energies vary less, as at
+        # rest
         energy_size=jnp.nanmax(energy.kinetic)
         + _span(energy.potential)
         + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
@@ -119,9 +118,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
 
 
 def lost_of(trajectory: Record) -> OverTimes | None:
-    """Return the energy lost in events until each saved time, J; None without events
-    at which the motion continues.
-    """
+    """Return the energy lost in events up to each saved time (J); None if the motion continued after none."""
     return trajectory.phases.lost_until(trajectory.ts) if trajectory.phases.ts.shape[-1] else None
 
 
@@ -164,7 +161,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             "configuration or another assembly; state a `domain` around the motion to decide"
         )
     elif smallest < np.sqrt(eps_of(trajectory.q)):
-        warned.append(f"constraints come within {smallest:.1e} of a loss of rank, where digits are lost")
+        warned.append(f"constraints nearly lose rank (singular value {smallest:.1e}): digits are lost there")
     for kind, residual, state in (
         ("geometric", found.position_residual, trajectory.q),
         ("velocity", found.velocity_residual, trajectory.u),
@@ -173,7 +170,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         if float(residual) > 1e-4 * (1.0 + float(_largest(state))):
             warned.append(
                 f"{kind} constraints are violated by up to {float(residual):.1e}: use projection or smaller "
-                "tolerances, or look for constraints that contradict each other"
+                "tolerances, or check for constraints that contradict each other"
             )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size and not _lacks_work(trajectory):
@@ -183,8 +180,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             "potentials and constraints with `verify`"
         )
     pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
-    # the error of an acceleration is round-off over the square of the pivot; motions
-    # with other states end there
+    # the error of an acceleration is round-off divided by the square of the pivot; motions with a minimal
+    # state or a scalar program end with a result code instead
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
             f"the reduction's independent speeds hardly determine the others (pivot {pivot:.1e}), "
@@ -194,10 +191,10 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
     by_clock = not trajectory.inputs.constant or bool(structure_whatever_its_faults(trajectory.scene).timed)
-    # a clock that resolves less than this part of a step rounds times noticeably
+    # rounding of times matters if it exceeds this part of a step
     if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
-            f"times are resolved to {resolved:.0e} s, steps are {step:.0e} s: loads, poses and inputs "
+            f"times are resolved to {resolved:.0e} s, but steps are {step:.0e} s: loads, poses and inputs "
             "receive rounded times; count time from zero, or use float64"
         )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
@@ -205,7 +202,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
 
 
 def summary(trajectory: Record, message: str) -> str:
-    """Return a printed summary: steps, drift, residuals, contacts, result."""
+    """Return the summary that `print` shows: result, steps, drift, residuals, contacts, warnings."""
     found = diagnose(trajectory)
     ts = np.asarray(trajectory.ts)
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
@@ -295,13 +292,13 @@ def summary(trajectory: Record, message: str) -> str:
 
 
 def _phases_text(trajectory: Record) -> str:
-    """Return the first events after which a motion continued."""
+    """Return a text on the first six events after which a motion continued, and the number of others."""
     lines = trajectory.phases.texts()
     return ("; ".join(lines[:6]) or "no event") + f"; and {len(lines) - 6} more" * (len(lines) > 6)
 
 
 def _left_domain(trajectory: Record) -> str:
-    """Return the coordinate or speed that left the scene's `domain` first, and when."""
+    """Return a text on the coordinate or speed that first left the scene's `domain`, and when, or ""."""
     scene, first = trajectory.scene, []
     for names, values in ((scene.coordinate_names, trajectory.q), (scene.speed_names, trajectory.u)):
         for k, name in enumerate(names.entries):
@@ -319,7 +316,7 @@ def _left_domain(trajectory: Record) -> str:
 
 
 def _channel_text(channel) -> str:
-    """Return the text for an input; missing ones are zero."""
+    """Return a text on an input: its value or its kind."""
     if isinstance(channel, Mode):
         return "a mode"
     if isinstance(channel, Constant):

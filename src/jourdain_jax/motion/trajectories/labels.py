@@ -1,8 +1,7 @@
-"""Motions as labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame` with names, times, result codes,
-parameters, and known units.
+"""Convert motions to labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame`.
 
-A scene states the units of its parameters. Units of coordinates and speeds are known only for quaternions and
-their angular velocities; the user supplies the others.
+A scene states the units of its parameters. Of coordinates and speeds, only quaternions and their angular
+velocities have known units; the user may supply the others.
 """
 
 import math
@@ -38,7 +37,7 @@ OF_LANES: dict[str, tuple[str, str, float, dict]] = {
         "int8",
         -1,
         {
-            "long_name": "how it was repeated",
+            "long_name": "how the motion was retried",
             "flag_masks": [1, 2],
             "flag_meanings": "full_state implicit_solver",
         },
@@ -49,8 +48,8 @@ OF_LANES: dict[str, tuple[str, str, float, dict]] = {
 
 @of_known_numbers
 def to_xarray(record: Record, units: Mapping[str, str] | None = None):
-    """Return the motion, or a batch of motions, as an `xarray.Dataset`; `units`: name of a
-    coordinate or speed -> its unit.
+    """Return a motion, or a batch of motions, as an `xarray.Dataset`. `units`: units of coordinates and
+    speeds by name.
     """
     xarray = needed("xarray", "a motion as labelled arrays")
     lanes = _lanes(record)
@@ -119,7 +118,7 @@ def _columns(record: Record) -> dict[str, np.ndarray]:
 
 
 def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
-    """Return units of quaternions, their angular velocities, and given ones."""
+    """Return the units of quaternions and their angular velocities, and the given ones, by name."""
     known: dict[str, str] = {}
     for names, unit in (
         (scene.coordinate_names, "1"),

@@ -1,4 +1,4 @@
-"""Small figures of motions for notebooks: coordinates over time."""
+"""Small plots of coordinates over time, shown in notebooks."""
 
 import numpy as np
 
@@ -12,10 +12,10 @@ def sketch(record: Record) -> str:
 
 
 def sketch_of_lanes(record: Record) -> str:
-    """Draw a batch of motions (leading axis): the median, and bands with half and 95 % of the running
-    samples. Return "" for samples with different saved times.
+    """Draw a batch of motions: the median, and bands that contain 50 % and 95 % of the samples still running.
+    Return "" if samples have different saved times.
     """
-    levels = 0.025, 0.25, 0.5, 0.75, 0.975  # the ends of two bands, the median between them
+    levels = 0.025, 0.25, 0.5, 0.75, 0.975  # the limits of two bands, with the median in the middle
     lanes = _spread(len(record.q), 1000)
     ts, q = np.asarray(record.ts[0]), np.asarray(record.q[lanes])
     if not np.all(np.asarray(record.ts) == ts):
@@ -33,8 +33,8 @@ def _spread(count: int, most: int = 120) -> np.ndarray:
 
 
 def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
-    """Draw the coordinates; `levels` (levels, times, coordinates): the line in the
-    middle, with bands around it.
+    """Draw the coordinates. `levels` (levels, times, coordinates): the middle level is drawn as a line, the
+    others as bands around it.
     """
     reached = np.flatnonzero(np.isfinite(levels).all(axis=(0, 2)))
     if reached.size < 2:

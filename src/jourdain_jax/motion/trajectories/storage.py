@@ -1,4 +1,4 @@
-"""Saving and loading motions as NumPy's `.npz`.
+"""Save and load motions as `.npz` files of NumPy.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent if not
 integrated), `t_end`, `q_end`, `u_end`, `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`,
@@ -10,11 +10,11 @@ numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `unwatched`
 (names of all arrays), `versions`, `digest` (SHA-256 of the rest of the header and of all arrays; files of
 earlier versions have none).
 
-`kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis: `result` is one code
-per sample. `reruns` in its header describes how samples with a `fallback` were repeated.
+`kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis: `result` has one code
+per sample. `reruns` in the header describes how samples with a `fallback` were retried.
 
-Loading raises an error if the digest does not match: the file is damaged or was changed. It also raises an
-error if the scene's class has changed its parameters, their units, or its names.
+Loading raises an error if the digest does not match, that is, if the file is damaged or was changed, and if
+the names, the parameters or their units differ from those of the scene's class.
 """
 
 import hashlib
@@ -46,7 +46,7 @@ from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.trace import velocity_quantities
 
-# without `work`, which may be absent
+# excluding `work`, which may be absent
 _ARRAYS = tuple(field.name for field in fields(Record) if hasattr(field.type, "dim_str"))
 _PHASES = tuple(f"phases.{field.name}" for field in fields(Phases) if hasattr(field.type, "dim_str"))
 _HEADER = (
@@ -66,12 +66,13 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 
 @of_known_numbers
 def save(motion: Trajectory | Rollout, path: FilePath) -> None:
-    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of
+    """Write a `motion`, one trajectory or a whole rollout, to the file `path` (`.npz`, format 1 of
     `motion/trajectories/storage.py`).
 
-    An existing file is replaced only when the new one is complete, so an interruption leaves the old one.
-    Inputs are stored as samples at the saved times. Raises ValueError if the path is a folder, or the scene
-    has a field that is not an array, number or text. Read the file with `load_trajectory` or `load_rollout`.
+    An existing file is replaced only once the new one is complete, so that an interruption does not damage
+    it. Inputs are stored as samples at the saved times. Raises ValueError if the path is a folder, or if the
+    scene has a field that is not an array, number or text. Read the file with `load_trajectory` or
+    `load_rollout`.
     """
     if not isinstance(motion, Trajectory | Rollout):
         raise ValueError(
@@ -134,7 +135,7 @@ def save(motion: Trajectory | Rollout, path: FilePath) -> None:
 
 
 def _digest(header: dict, arrays: dict) -> str:
-    """Return the digest of all arrays and of the header without its digest."""
+    """Return the digest of all arrays and of the header, excluding its own digest."""
     found = hashlib.sha256(json.dumps(header | {"digest": ""}, sort_keys=True).encode())
     for name, x in sorted(arrays.items()):
         found.update(f"{name} {x.dtype.str} {x.shape} ".encode() + x.tobytes())
@@ -147,11 +148,11 @@ def _sampled(inputs: Inputs, ts):
 
 @with_nan_as_a_mark
 def load_trajectory(path: FilePath, scene: Scene | type[Scene]) -> Trajectory:
-    """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that
-    class; parameters come from the file.
+    """Read a trajectory that `save` wrote to `path`. `scene`: the scene's class, or any scene of that class;
+    parameters come from the file.
 
-    Raises ValueError if the file cannot be read, has another format, contains a rollout,
-    or belongs to another scene.
+    Raises ValueError if the file cannot be read, has another format, contains a rollout, or belongs to
+    another scene.
     """
     header, arrays, kind = _read(path, scene, "trajectory")
     lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
@@ -160,8 +161,7 @@ def load_trajectory(path: FilePath, scene: Scene | type[Scene]) -> Trajectory:
 
 @with_nan_as_a_mark
 def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
-    """Read a rollout written by `save` from `path`: all its samples, including failed
-    ones, each with its result code.
+    """Read a rollout that `save` wrote to `path`, with all samples, including failed ones, and result codes.
 
     `scene`: the scene's class, or any scene of that class; parameters come from the file. Raises ValueError
     if the file cannot be read, has another format, contains one trajectory, or belongs to another scene.
@@ -175,8 +175,8 @@ def load_rollout(path: FilePath, scene: Scene | type[Scene]) -> Rollout:
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
-    """Return trajectories from arrays with a batch axis. They are built under
-    `vmap`, where no value is rejected.
+    """Return trajectories from arrays with a batch axis. Scenes are created under `vmap`, so that their
+    checks of values reject none.
     """
     samples = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
     longest = max(len(times) for times, _ in samples)  # samples with fewer input times repeat their last one
@@ -186,7 +186,7 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     arrays["inputs"] = np.stack(
         [np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples]
     )
-    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` passes NumPy arrays on unchanged
+    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` would not trace NumPy arrays
     try:
         lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
     except _NEEDS_NUMBERS:  # the class reads the values when a scene is created
@@ -262,15 +262,15 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
 
 
 def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return samples of the inputs in increasing time, also for reversed time, without unreached times."""
+    """Return the input samples at the reached times, in order of increasing time also for reversed time."""
     reached = np.flatnonzero(np.isfinite(ts))
     times, first = np.unique(ts[reached], return_index=True)
     return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))
 
 
 def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
-    """Return the class of the scene. Raises ValueError if it is not the one in the file, or if its
-    parameters or names have changed.
+    """Return the class of the scene. Raises ValueError if the file belongs to another class, or has
+    parameters that the class lacks.
     """
     kind = scene if isinstance(scene, type) else type(scene)
     if not issubclass(kind, Scene):
@@ -293,7 +293,7 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 
 def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
-    """Return header and arrays of a file of this kind, and the class of its scene."""
+    """Return the header and the arrays of a file of this kind, and the class of its scene."""
     what = f"a {kind} file written by `save`"
     with opened(path, what) as file:
         arrays = parsed(_unpacked, file, f"`{path}`", what)
@@ -325,8 +325,8 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
 
 
 def _unpacked(file) -> dict[str, np.ndarray]:
-    """Return the arrays of a zip archive by name. Memory is allocated only for actual content,
-    whatever size an entry claims.
+    """Return the arrays of a zip archive by name. Memory is allocated for the actual content only, even if an
+    entry claims a larger size.
     """
     found = {}
     with zipfile.ZipFile(file) as archive:
@@ -352,7 +352,7 @@ def _unpacked(file) -> dict[str, np.ndarray]:
 
 
 def _parameters(arrays: dict) -> dict:
-    """Return the parameters of the scene among the arrays of a file."""
+    """Return the scene's parameters from the arrays of a file, by name."""
     return {
         name.removeprefix("parameter:"): value
         for name, value in arrays.items()
@@ -361,8 +361,8 @@ def _parameters(arrays: dict) -> dict:
 
 
 def _stored_fields(scene: Scene) -> tuple[dict, dict]:
-    """Return fields that are arrays, including parameters, and fields that are plain numbers or
-    texts, such as a number of bodies.
+    """Return the scene's fields that are arrays, including parameters, and the fields that are plain numbers
+    or texts, such as a number of bodies.
     """
     values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
     arrays = {
@@ -381,7 +381,7 @@ def _refused(path, sentence: str) -> ValueError:
 
 
 def _check_scene(path, scene: Scene) -> None:
-    """Raise ValueError if parameters have shapes that do not suit the scene."""
+    """Raise ValueError if the shapes of parameters do not suit the scene."""
 
     def quantities(scene):
         q, u, _ = scene.named()

@@ -1,4 +1,4 @@
-"""Trajectory with access by name and diagnostics."""
+"""Trajectories: motions over time, with access by name and diagnostics."""
 
 from collections.abc import Mapping
 
@@ -31,16 +31,16 @@ from jourdain_jax.scene.scene import state_names
 
 
 class Trajectory(Record, Printed):
-    """Motion over time. Times after an early end (event, failure) hold NaN.
+    """Motion over time. Values at times after an early end (event, failure) are NaN.
 
-    `t_end`, `q_end`, `u_end` are the last state reached; for a failed motion they are the state of the
-    failure, with NaN derivatives. Use `motion.nan_if_failed()` in automatic computations such as a loss,
-    or check `motion.succeeded`.
+    `t_end`, `q_end`, `u_end` are the last state reached. If the motion failed, this is the state at the
+    failure, with NaN derivatives. In a loss or other automatic computation, use `motion.nan_if_failed()` or
+    check `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
-        """Return a coordinate, speed, quaternion or angular velocity by name, at
-        all times; `"t"` for the times.
+        """Return the coordinate, speed, quaternion or angular velocity `name` at all times; `"t"` returns the
+        times.
         """
         if name == "t":
             return self.ts
@@ -64,7 +64,7 @@ class Trajectory(Record, Printed):
 
     @property
     def succeeded(self) -> Bool[Array, "*lanes"]:
-        """Return whether the motion reached the end of its span or an event. It works under jit and vmap."""
+        """Return whether the motion reached the end of its span or an event. Works under jit and vmap."""
         return jnp.asarray(self.result) <= result_codes.EVENT
 
     @property
@@ -74,8 +74,8 @@ class Trajectory(Record, Printed):
 
     @property
     def end(self) -> State:
-        """Return the last state reached, projected onto the constraints; for many motions a batch of states.
-        Another motion can continue from it at its time:
+        """Return the last state reached, projected onto the constraints; for a batch of motions, a batch of
+        states. Another motion can start from it:
 
             motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
         """
@@ -84,8 +84,8 @@ class Trajectory(Record, Printed):
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
     def phase(self, mode: str) -> Float[Array, "*lanes times"]:
-        """Return the number of a mode's value at all times; at an event that
-        switches it, the value afterwards.
+        """Return the index of the value of `mode` at all times; at an event that switches it, the index
+        afterwards.
         """
         check_name(mode, self.scene.modes.names, f"`{type(self.scene).__name__}` has no mode `{mode}`")
         return map_over_times(values_in_time.InputOf(mode), self)
@@ -104,8 +104,8 @@ class Trajectory(Record, Printed):
         return map_over_times(values_in_time.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
-        """Return kinetic and potential energy, and the integrated work, in J. `.balance` is
-        constant for a correct motion.
+        """Return the kinetic and potential energy and the integrated work over time, in J. Their `.balance`
+        is constant for a correct motion.
         """
         kinetic, potential = map_over_times(values_in_time.energies, self)
         return Energies(kinetic, potential, self.work, lost_of(self))
@@ -115,14 +115,15 @@ class Trajectory(Record, Printed):
         return map_with_accelerations(values_in_time.AccelerationsBySvd, self)
 
     def constraint_forces(self) -> RowReactions:
-        """Return constraint forces per constraint and per body at all times, eqs. (68)-(70);
-        `.forces_on("disc")` by constraint, in N, inertial frame.
+        """Return constraint forces per constraint and per body at all times, eqs. (68)-(70).
+
+        `.forces_on("disc")` of the result gives the forces on a body by constraint (N, inertial frame).
         """
         return map_with_accelerations(values_in_time.Reactions, self)
 
     def contact_forces(self) -> dict[str, ContactForce]:
-        """Return, for every rolling contact at all times, the normal and tangential force (N) on the body and
-        the friction coefficient that it needs.
+        """Return the normal and tangential force (N) on the body and the friction coefficient needed, for
+        each rolling contact at all times.
         """
         return map_with_accelerations(values_in_time.Contacts, self)
 
@@ -133,20 +134,22 @@ class Trajectory(Record, Printed):
         return map_over_times(values_in_time.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
-        """Return quantities that the scene declares conserved, without the energy, by name at all times."""
+        """Return the quantities that the scene declares conserved, by name at all times. Energy is not
+        included.
+        """
         return map_over_times(values_in_time.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
-        `units`: name of a coordinate or speed -> its unit, stored as `attrs["units"]`, because a scene states
-        only units of parameters. ImportError without xarray.
+        `units`: units of coordinates and speeds by name, stored as `attrs["units"]`; a scene states only
+        units of parameters. Raises ImportError without xarray.
         """
         return labels.to_xarray(self, units)
 
     def to_pandas(self):
-        """Return coordinates and speeds as a `pandas.DataFrame`, one row per time
-        (s). ImportError without pandas.
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row per time (s). Raises ImportError
+        without pandas.
         """
         return labels.to_pandas(self)
 
@@ -164,7 +167,7 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def message(self) -> str:
-        """Return a message on how the motion ended."""
+        """Return a sentence on how the motion ended."""
         code = int(self.result)
         text = result_codes.MESSAGES[code]
         if code == result_codes.EVENT:
@@ -175,13 +178,13 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def warnings(self) -> Sentences:
-        """Return reasons to doubt the motion, the most serious first; empty if there are none.
-        The printed summary shows them.
+        """Return reasons to doubt the motion, the most serious first; empty if there are none. The printed
+        summary shows them.
 
-        Reasons are a failure; constraints at or near a change of rank, so that constraint forces and derived
-        quantities may not be unique; independent speeds of a reduction that do not determine the others in
-        this precision; contacts that would have to pull. They are computed on request and need concrete
-        numbers: not under jit or vmap.
+        Reasons are, among others: a failure; constraints that change or nearly lose their rank, so that
+        constraint forces may not be unique; a reduction whose independent speeds do not determine the others
+        in this precision; contacts that would have to pull. They are computed on each access, from concrete
+        numbers, so not under jit or vmap.
         """
         failure = () if int(self.result) <= result_codes.EVENT else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
@@ -193,10 +196,10 @@ class Trajectory(Record, Printed):
 
     @property
     def faults(self) -> Sentences:
-        """Return known causes of a failure, for messages.
+        """Return the known causes of a failure, as texts for messages.
 
-        Causes are parameters that are not finite or have the wrong sign, otherwise impossible values of
-        bodies, contacts and gravity; if steps became short, a load that jumps or has a kink.
+        For a bad parameter: parameters that are not finite or have the wrong sign, or else impossible values
+        of bodies, contacts and gravity. If steps became short: a load that jumps or has a kink.
         """
         code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
         if code in (
@@ -207,7 +210,9 @@ class Trajectory(Record, Printed):
             result_codes.STIFF,
         ):
             load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
-            said = " jumps, or has a kink, at the last state; smooth it over a short range, as by `jnp.tanh`"
+            said = (
+                " jumps, or has a kink, at the last state; smooth it over a short range, as with `jnp.tanh`"
+            )
             return (f"{load}{'' if code == result_codes.STICKS else said}",) if load else ()
         if code != result_codes.BAD_PARAMETER:
             return ()
@@ -221,14 +226,14 @@ class Trajectory(Record, Printed):
         )
 
     def nan_if_failed(self) -> "Trajectory":
-        """Return the trajectory, with NaN states if it reached neither its end nor an event. Works under
-        `jit`, `vmap` and `grad`, and for each sample of a batch.
+        """Return the trajectory; if it failed, with NaN states. Works under `jit`, `vmap` and `grad`, and for
+        each sample of a batch.
 
             motion = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0)
             loss = lambda radius: motion(radius).nan_if_failed().q_end[0]
 
-        Derivatives of NaN states are NaN, too. Samples excluded from a loss by `jnp.where(motion.succeeded,
-        ..., 0.0)` do not disturb its derivatives with respect to shared values.
+        Derivatives of NaN states are NaN, too. Failed samples that `jnp.where(motion.succeeded, ..., 0.0)`
+        excludes from a loss do not affect the derivatives of the loss.
         """
         states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]
         failed = lambda x: jnp.broadcast_to(
@@ -238,11 +243,11 @@ class Trajectory(Record, Printed):
 
     @of_known_numbers
     def raise_if_failed(self) -> "Trajectory":
-        """Return the trajectory itself; raise a SimulationError with reason and time if it reached
-        neither its end nor an event.
+        """Return the trajectory unchanged. Raise a SimulationError with the reason and the time if it failed,
+        that is, reached neither its end nor an event.
 
-        Raises DifferentiationModeError under `jit` and `vmap`, where numbers are
-        unknown; use `nan_if_failed` there.
+        Raises DifferentiationModeError under `jit` and `vmap`, where numbers are unknown; use `nan_if_failed`
+        there.
         """
         if int(self.result) > result_codes.EVENT:
             raise result_codes.SimulationError(

@@ -1,4 +1,4 @@
-"""Quantities along a recorded motion: a function of one state, mapped over all saved times."""
+"""Compute quantities along a motion: map functions of one state over all saved times."""
 
 from functools import partial
 from typing import NamedTuple
@@ -30,11 +30,11 @@ from jourdain_jax.structure.structure import structure_whatever_its_faults, usua
 
 
 class Phases(eqx.Module, Printed):
-    """Phases of a motion, separated by events at which it continues."""
+    """Phases of a motion, separated by the events after which it continues."""
 
     ts: Float[Array, "transitions"]  # s, of these events; NaN after the last one
     events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
-    modes: Float[Array, "modes phases"]  # numbers of their values in each phase
+    modes: Float[Array, "modes phases"]  # index of each mode's value in each phase
     lost: Float[Array, "transitions"]  # J, loss of T + V at each event
     event_names: Labels = static()
     named: Modes = static()
@@ -45,7 +45,7 @@ class Phases(eqx.Module, Printed):
         return jnp.sum(jnp.isfinite(self.ts), axis=-1)
 
     def texts(self) -> list[str]:
-        """Return one line per event: its time, its name, the modes that it switched and the energy lost."""
+        """Return one line per event: its time, its name, the modes it switched, and the energy it took."""
         ts, events, modes, lost = (np.asarray(x) for x in (self.ts, self.events, self.modes, self.lost))
         lines = []
         for k in range(int(self.count)):
@@ -61,13 +61,13 @@ class Phases(eqx.Module, Printed):
         return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())])
 
     def lost_until(self, ts: Float[Array, "*lanes times"]) -> Float[Array, "*lanes times"]:
-        """Return the loss of T + V by events until each time `ts` (s), in J."""
+        """Return the loss of T + V (J) in all events up to each time `ts` (s)."""
         ahead = (self.ts[..., None, :] - ts[..., None]) * jnp.sign(ts[..., -1:] - ts[..., :1])[..., None]
         return jnp.sum(jnp.where(ahead <= 0, self.lost[..., None, :], 0.0), axis=-1)
 
 
 def one_phase(event_names: Labels) -> Phases:
-    """Return the phases of a motion with a single phase, without modes."""
+    """Return the phases of a motion that has a single phase and no modes."""
     none = jnp.zeros(0)
     return Phases(none, none.astype(jnp.int32), jnp.zeros((0, 1)), none, event_names, Modes())
 
@@ -89,15 +89,15 @@ class Record(eqx.Module):
     accepted: Count  # steps
     rejected: Count
     last_step: Scalar  # s, proposed by step-size control for the next step; NaN if unknown
-    # number of sign changes of relations (`<`, `abs`, `floor`, ...) in loads, poses and
-    # constraints; -1: not monitored
+    # how often relations (`<`, `abs`, `floor`, ...) in loads, poses and constraints changed sign; -1: not
+    # monitored
     crossings: Count
-    fallback: Count  # how the motion was repeated, see `results.FALLBACKS`; 0: as requested
+    fallback: Count  # how the motion was retried, see `result_codes.FALLBACKS`; 0: not retried
     moved_q: Scalar  # change of the start by its projection
     moved_u: Scalar
-    # smallest pivot of the independent speeds along the motion (lowered: of the elimination,
-    # relative to its usual size), negative if it changed sign; for the full state with dense
-    # matrices, of the reduction, or 1 without
+    # smallest pivot along the motion, negative if it changed sign. With a scalar program: of the elimination,
+    # relative to its typical size. With dense matrices: of the independent speeds; for the full state, of the
+    # reduction (1 if it has none)
     smallest_pivot: Scalar
     inputs: Inputs
     phases: Phases
@@ -105,7 +105,7 @@ class Record(eqx.Module):
     reduction: str = static()
     solver: str = static()
     projected: bool = static()
-    unwatched: str = static()  # why steps do not monitor relations; empty if they do, or there are none
+    unwatched: str = static()  # why relations are not monitored; empty if they are, or if there are none
     event_names: Labels = static()
 
 
@@ -115,32 +115,32 @@ def first_scene(record: Record) -> Scene:
 
 
 def map_with_accelerations(f: type, record: Record):
-    """Evaluate `f(usual)`, a kind of `OfAccelerations`, at all times."""
+    """Evaluate an `OfAccelerations` of class `f` at all times."""
     usual = usual_rows(first_scene(record), varied=record.q.ndim > 2)
     return map_over_times(f(jax.tree.map(jnp.asarray, usual)), record, by_inputs=True)
 
 
 @with_usual_promotion
 def map_over_times(f, record: Record, by_inputs: bool = False):
-    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at unreached times. f must be a named function
+    """Evaluate `f(scene, t, q, u, inputs)` at all times; NaN at unreached times. `f` must be a named function
     or a module, because it is a cache key.
 
-    `by_inputs`: whether f needs the rates of the inputs, because constraints depend on varying ones. For a
-    batch of motions the batch axes come first.
+    `by_inputs`: f needs the rates of inputs if constraints depend on varying inputs. For a batch of motions,
+    the batch axes come first.
     """
-    # accelerations depend on the rates of the inputs
+    # accelerations then depend on the rates of the inputs
     by_inputs = (
         by_inputs
         and not record.inputs.constant
         and structure_whatever_its_faults(first_scene(record)).rows_of_inputs
     )
     known = not is_traced((f, record))
-    # for one concrete motion NumPy finishes before a program is compiled (contact forces of a bicycle at
-    # 101 times: 1 s instead of 7)
+    # for one concrete motion, NumPy takes less time than compilation (contact forces of a bicycle at 101
+    # times: 1 s instead of 7)
     if known and record.q.ndim == 2 and len(record.ts) <= 1000:
         return _on_numpy(f, record, by_inputs)
     mapped = _compiled(record.inputs.programs)
-    # then NaN is not a marker
+    # if all times were reached, NaN is not a marker
     whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))
     return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs)
 
@@ -162,8 +162,8 @@ _compiled = for_programs(_mapped)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
-    """Return `f` at one state. For an unreached time, f is evaluated at the end of the motion, and
-    its result is replaced by NaN.
+    """Return `f` at one state. At an unreached time, evaluate f at the end state and replace its result by
+    NaN.
     """
     reached = jnp.all(jnp.isfinite(q))
     t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
@@ -173,8 +173,8 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
 
 def _largest_block(record: Record) -> int:
     """Return the number of times at which quantities are computed together."""
-    # limit on entries of square matrices of the coordinates: for 200 trailers at 201 times, derivatives of
-    # all poses took more than 23 GB
+    # limit on the entries of all (coordinates x coordinates) matrices: for 200 trailers at 201 times,
+    # derivatives of all poses took more than 23 GB
     return max(1, 4_000_000 // record.q.shape[-1] ** 2)
 
 
@@ -192,8 +192,8 @@ _uncompiled = eval_numpy(_at_one_time)
 
 
 class BodyPoint(eqx.Module):
-    """Position (m, inertial frame) of the point of a body with coordinates `local` (m, body
-    frame, from the mass centre).
+    """Position (m, inertial frame) of the point of a body with body-frame coordinates `local` (m, from the
+    mass centre).
     """
 
     body: str = static()
@@ -209,7 +209,7 @@ def energies(scene, t, q, u, inputs):
 
 
 class InputOf(eqx.Module):
-    """Input with a given name."""
+    """Value of the input `name`."""
 
     name: str = static()
 
