@@ -273,7 +273,7 @@ NAMES: dict[str, Case] = {
         "`inputs` of `Described` is the text 'push', expected names; write inputs = jj.inputs('a b c')"
     ),
     "described(speeds=jj.speeds('a b'))": (
-        "`Described` has its own speeds (a, b) but no rates of its coordinates"
+        "`Described` defines speeds (a, b) but not the rates of its coordinates"
     ),
     "described(domain={'z': (0.0, 1.0)})": (
         "`domain` of `Described` names `z`, which is not a coordinate or speed"
@@ -327,8 +327,8 @@ PARTS: dict[str, Case] = {
         "second point of a rod has shape (2,), expected (3,); give three components in the inertial frame, m"
     ),
     "jj.pin(two, o)": "first point of a pin has shape (2,), expected (3,)",
-    "jj.pin(o, o, axes=3)": "pin along axes `3`, expected letters out of `xyz`",
-    "jj.pin(o, o, axes='')": "pin along axes ``, expected letters out of `xyz`, such as `xyz` or `xy`",
+    "jj.pin(o, o, axes=3)": "`axes` of a pin is `3`, expected letters out of `xyz`",
+    "jj.pin(o, o, axes='')": "`axes` of a pin is ``, expected letters out of `xyz`, such as `xyz` or `xy`",
     "jj.knife_edge(moving['bead'], two, o)": (
         "contact of the knife edge of `bead` has shape (2,), expected (3,)"
     ),

@@ -450,7 +450,8 @@ def test_bad_contacts():
     with pytest.raises(
         ValueError,
         match=(
-            "`linearize` needs contacts that roll and constraints that hold, but `cloth` of `Ball` may slip"
+            "`linearize` supports only rolling contacts and constraints that never slip, "
+            "but `cloth` of `Ball` may slip"
         ),
     ):
         jj.linearize(Ball(), {"z": 0.0285})

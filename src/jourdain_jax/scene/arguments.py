@@ -1,9 +1,10 @@
 """Checks of arguments of public functions: the scene, vectors of q and u, inputs.
 
-The checks read kinds and shapes, which are known during tracing, so compiled programs contain none of them.
+The checks read types and shapes only. Both are known during tracing, so the checks add
+nothing to compiled programs.
 
-Tracebacks of errors in a user's methods show the user's lines and omit lines of this package and of JAX. With
-JAX_TRACEBACK_FILTERING=off they show all lines. Other errors keep their whole traceback.
+The traceback of an error in a user's method shows only the user's lines; set JAX_TRACEBACK_FILTERING=off to
+see all lines. Tracebacks of other errors are complete.
 """
 
 import sys
@@ -40,8 +41,8 @@ F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
-    """A scene with its choices (`motion/model.py: Model`), accepted in place of a scene by functions that
-    call `as_scene`.
+    """A scene with its formulation, backend and memory: the base of `Model` (`motion/model.py`). Functions
+    that call `as_scene` accept it in place of a scene.
     """
 
     scene: Scene
@@ -57,8 +58,7 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """Return the scene of a scene or model. Raises ValueError for any other value, such as the class of a
-    scene.
+    """Return `scene`, or the scene of a model. Raises ValueError for any other value, such as a scene class.
     """
     if isinstance(scene, Scene):
         return scene
@@ -75,22 +75,24 @@ def as_scene(scene) -> Scene:
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """Return the scene. Raises ValueError if a contact or a velocity constraint may slip, which the function
-    `what` does not support.
+    """Return `scene`, or the scene of a model. Raises ValueError if a contact or a velocity constraint may
+    slip, which the function named `what` does not support.
     """
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
         raise ValueError(
-            f"`{what}` needs contacts that roll and constraints that hold, but {named} of "
-            f"`{type(scene).__name__}` may slip; omit the friction there"
+            f"`{what}` supports only rolling contacts and constraints that never slip, but {named} of "
+                f"`{type(scene).__name__}` may slip; remove the friction there"
         )
     return scene
 
 
 def of_known_numbers(function: F) -> F:
-    """Return a function of a scene or motion that runs on concrete numbers, also inside `jit`, `vmap` and
-    derivatives. For a traced argument it raises DifferentiationModeError with its name.
+    """Decorate a function of a scene or motion so that it computes with concrete numbers, even inside
+    `jit`, `vmap` and derivatives.
+
+    For a traced argument the decorated function raises DifferentiationModeError with its own name.
     """
 
     @wraps(function)
@@ -114,16 +116,16 @@ def as_time(t) -> Scalar:
 
 
 def one_time(t, name: str = "t"):
-    """Return a time on NumPy unless it is traced; None stays None. Raises ValueError with the name of the
-    argument for any other value.
+    """Return a time as a NumPy number, a tracer if it is traced, or None if it is None. Raises ValueError,
+    with the argument's name, for any other value.
     """
     advice = "give one time in s; use `jax.vmap` for many"
     return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice=advice)
 
 
 def vector_of_times(ts) -> Float[Entries, "times"]:
-    """Return a vector of times in s, on NumPy unless they are traced. Raises ValueError for another shape,
-    and if it is empty.
+    """Return a vector of times in s, as a NumPy array unless it is traced. Raises ValueError if
+    it is empty or not a vector.
     """
     ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
     if ts.ndim != 1 or ts.size == 0:
@@ -137,7 +139,9 @@ def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
 
 
 def as_speeds(scene: Scene, u, what: str = "u") -> Speeds:
-    """Return u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
+    """Return u, or another vector over the speeds, as a vector of the scene's speeds.
+    `what`: its name in messages.
+    """
     return _as_vector(scene, what, u, as_scene(scene).speed_names.entries)
 
 
@@ -157,7 +161,9 @@ def _as_vector(scene: Scene, what: str, x, names: Labels) -> Array:
 
 
 class ChangingInputs(eqx.Module):
-    """Inputs near one time. Accelerations depend on the rates of inputs that occur in constraints."""
+    """Inputs as linear functions of time near `t`. The rates matter where inputs occur in constraints:
+    accelerations depend on them.
+    """
 
     t: Scalar  # s
     values: Float[Array, "inputs"]
@@ -184,7 +190,7 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
             advice=f"one number for each of {listed}",
         )
     check_names(inputs, names, f"`{type(scene).__name__}` has no input `{{}}`")
-    advice = "a function of time is for `simulate`; here give its value at this instant"
+    advice = "give its value at this instant; only `simulate` takes functions of time"
     inputs = {
         name: scene.modes.number(name, x, "`inputs`") if name in dict(scene.modes.pairs) else x
         for name, x in inputs.items()
@@ -205,8 +211,8 @@ _NOTE = (
 
 
 def shown_from_users_lines(function: F) -> F:
-    """Return the function with shorter tracebacks: only the user's lines, if there are any, as in a method of
-    a scene. Inside it, JAX promotes types as usual.
+    """Decorate a function so that the tracebacks of its errors show only the user's lines, if there are any,
+    such as lines of a scene's method. While it runs, JAX promotes types by its default rules.
     """
 
     @wraps(function)
@@ -233,7 +239,9 @@ def warn(text: str, kind: type[Warning] = UserWarning) -> None:
 
 
 def _is_shortened(error: BaseException) -> bool:
-    """Return whether the traceback contains a user's line. If so, add to the error how to see all lines."""
+    """Return whether the traceback contains a user's line. If so, add a note to the
+    error on how to see all lines.
+    """
     if jax.config.jax_traceback_filtering == "off":
         return False
     if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):
@@ -257,7 +265,7 @@ def _is_users(frame: FrameType) -> bool:
 
 
 def _of_users(traceback: TracebackType | None) -> TracebackType | None:
-    """Return the traceback without lines of this package and of JAX."""
+    """Return the traceback with the user's lines only."""
     kept: TracebackType | None = None
     for entry in reversed(_frames(traceback)):
         if _is_users(entry.tb_frame):

@@ -20,7 +20,7 @@ class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
     Raises ValueError for other shapes. Its velocity is the derivative of the position. A mass that depends on
-    time or coordinates enters `m a` with its momentary value; state the thrust of ejected mass as a load.
+    time or coordinates enters `m a` with its instantaneous value; add the thrust of ejected mass as a load.
     """
 
     mass: Scalar  # kg
@@ -37,16 +37,16 @@ class RigidBody(eqx.Module):
     - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body
       axes.
     - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to
-      space components. Column k, `R[:, k]`, is body axis k in the inertial frame. The row `R[k]` is a
-      different vector, and no check detects its use as an axis.
+      space components. Column k, `R[:, k]`, is body axis k in the inertial frame. Do not take the row
+      `R[k]` for an axis: it is a different vector, and no check detects the mistake.
     - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only
       (default: none). If `solid` is "box", "ellipsoid" or "wheel", the only point is the corner of the
       solid's bounding box.
 
-    Raises ValueError for other shapes. Velocities are derivatives of the pose. A mass or inertia that depends
-    on time or coordinates enters `m a` and `I alpha + omega x I omega` with its momentary value: mass that
-    leaves or joins has the velocity of the body. State a thrust as a load. Model a skater who draws in the
-    arms by several bodies.
+    Raises ValueError for other shapes. Velocities are derivatives of the pose. A mass or inertia that
+    depends on time or coordinates enters `m a` and `I alpha + omega x I omega` with its instantaneous value,
+    as if mass that leaves or joins moved with the body. Add a thrust as a load. Use several bodies for a
+    skater who draws in the arms.
     """
 
     mass: Scalar  # kg
@@ -85,9 +85,9 @@ class RigidBody(eqx.Module):
     ) -> "RigidBody":
         """Return a disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
 
-        Its moments are uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are
-        given, in kg m^2. `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
-        Raises ValueError for another axis.
+        The default moments are those of a uniform disc, `C = m a^2/2` (axial) and `A = m a^2/4` (diametral);
+        `axial` and `diametral`, in kg m^2, replace them. `mass` in kg; `position` (m, mass centre) and
+        `orientation` as in `RigidBody`. Raises ValueError for another axis.
         """
         mass, radius = checked_real(mass, "mass of a disc", ()), checked_real(radius, "radius of a disc", ())
         axial = mass * radius**2 / 2 if axial is None else axial

@@ -1,8 +1,8 @@
 """Ready-made constraints.
 
 Each function returns a value that is zero while the constraint holds. A geometric constraint is a function of
-a `Pose`, to be named in `geometric_constraints` of a scene; the engine differentiates it in time. A velocity
-constraint is a function of a `Motion`, to be named in `velocity_constraints`.
+a `Pose`; return it by name from `geometric_constraints` of a scene. The engine differentiates it with respect
+to time. A velocity constraint is a function of a `Motion`; return it by name from `velocity_constraints`.
 """
 
 from typing import Any
@@ -29,14 +29,14 @@ def _point(position: Vector, what: str) -> Vector3:
 
 
 def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector, *, holds: Any = None) -> Scalar | HeldRow:
-    """Return the velocity constraint of a blade or skate, `v(contact) . lateral` in m/s: the point of `body`
-    at `contact` does not move along `lateral`.
+    """Return the velocity constraint of a blade or skate, `v(contact) . lateral` in m/s, eq. (7): the point
+    of `body` at `contact` does not move along `lateral`.
 
-    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq.
-      (7). The body axis y is `body.orientation[:, 1]`, a column.
+    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. The
+      body axis y is `body.orientation[:, 1]`, a column.
     - `holds`: the largest sideways force F in N, a number or a function of the motion, or
-      `jj.Coulomb(sliding, static)` with two forces. Under a larger force the blade slips against F until the
-      slip has come to rest (`motion.phase`). None: the blade holds any force.
+      `jj.Coulomb(sliding, static)` with two forces. If the constraint needs a larger force, the blade slips,
+      opposed by F, until its sideways velocity is zero again (`motion.phase`). None: the blade never slips.
     """
     what = f"the knife edge of `{body.name}`"
     contact = _point(contact, f"contact of {what}")
@@ -47,10 +47,10 @@ def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector, *, holds: Any
 
 def rod(a: Vector, b: Vector, length: Number) -> Scalar:
     """Return the geometric constraint of a massless rod of the given `length` (m) between two points `a`, `b`
-    (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
+    (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m. Eq. (5).
 
     To first order the value is the excess length. The multiplier is the thrust in the rod (N, positive in
-    compression). The value is smooth even if the points meet. Eq. (5).
+    compression). The value is smooth even where the points coincide.
     """
     apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
     length = checked_positive(
@@ -60,14 +60,13 @@ def rod(a: Vector, b: Vector, length: Number) -> Scalar:
 
 
 def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
-    """Return the geometric constraints `b - a` of a joint that keeps two points `a`, `b` (m, inertial frame)
-    together.
+    """Return the geometric constraints `b - a` of a joint that keeps two points `a`, `b` (m,
+    inertial frame) together. Eq. (5).
 
-    `axes`: letters of the constrained inertial axes (`"xy"` in a plane). Raises ValueError for others. Eq.
-    (5).
+    `axes`: letters of the constrained inertial axes (`"xy"` in a plane). Raises ValueError for other letters.
     """
     if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
-        raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
+        raise ValueError(f"`axes` of a pin is `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
     apart = _point(b, "second point of a pin") - _point(a, "first point of a pin")
     return apart[jnp.array(["xyz".index(axis) for axis in axes])]
 

@@ -40,8 +40,8 @@ class Names:
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Return the position of `name`. Raises ValueError with the valid names for an unknown `kind` of
-        name.
+        """Return the index of `name`. Raises ValueError, with the valid names, if it is unknown; `kind`: the
+        kind of name, for the message.
         """
         check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
@@ -130,17 +130,17 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
 
 
 def speeds(names: str) -> Names:
-    """Return the names of user-defined generalized speeds (quasi-velocities), separated by spaces in `names`;
-    eqs. (53)-(56).
+    """Return the names of user-defined generalized speeds (quasi-velocities, eqs. (53)-(56)) from
+    `names`, a text separated by spaces.
 
-    The scene then states `coordinate_rates(t, q, u)`. Raises ValueError as in `coordinates`.
+    A scene with such speeds must define `coordinate_rates(t, q, u)`. Raises ValueError as in `coordinates`.
     """
     return _named(names, "speed")
 
 
 def inputs(names: str) -> Names:
-    """Return the names of a scene's inputs, such as actuator torques, separated by spaces in `names`. The
-    scene decides on their units. Raises ValueError as in `coordinates`.
+    """Return the names of a scene's inputs, such as actuator torques, from `names`, a text separated by
+    spaces. The scene defines their units. Raises ValueError as in `coordinates`.
     """
     return _named(names, "input")
 
@@ -177,4 +177,5 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if name == "t" and kind != "input":
             raise ValueError(f"{kind} name `t` is reserved for time (`motion.t`); choose another")
         if name in ("array", "slots", "keys"):
-            raise ValueError(f"{kind} name `{name}` is reserved: `q.{name}` has a meaning; choose another")
+            raise ValueError(f"{kind} name `{name}` is reserved: `q.{name}` already has a meaning; choose "
+                "another")

@@ -1,6 +1,6 @@
 """Checks of a scene's class: spelling of methods, known coordinate names, ordered bounds.
 
-Without them, a method with a misspelt name would be ignored, and with it a force or a constraint.
+Without these checks, a misspelt method would be ignored, and its force or constraint would be missing.
 """
 
 import difflib
@@ -42,7 +42,7 @@ ATTRIBUTES = (
     "example",
     "example_span",
 )
-_MEANT = {  # what other programs and textbooks call them
+_MEANT = {  # names in other programs and textbooks
     "forces": "loads",
     "applied_forces": "loads",
     "torques": "loads",
@@ -69,9 +69,9 @@ def check_description(scene, base: Any) -> None:
     check_kind(scene.modes, Modes, f"`modes` of `{kind.__name__}`", "jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
-            f"`{kind.__name__}` has its own speeds ({', '.join(scene.speeds.entries)}) but no rates of its "
-            "coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
-            "coordinates"
+            f"`{kind.__name__}` defines speeds ({', '.join(scene.speeds.entries)}) but not the rates of its "
+                "coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
+                "coordinates"
         )
     _check_counts(scene)
     for name in scene.speed_names.entries:
@@ -105,7 +105,8 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """Return a sentence about a misspelt method, attribute or field of a class; empty if there is none."""
+    """Return an error message about a misspelt method, attribute or field of a class; empty if there is none.
+    """
     own = {field.name for field in fields(kind)}
     owners = [owner for owner in kind.__mro__ if owner not in base.__mro__]
     read = {
@@ -129,10 +130,10 @@ def _misspelt(kind: type, base: type) -> str:
                 continue
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
-            # the cutoff takes `load` for `loads`, but not `contact_arm` for `contacts`
+            # the cutoff matches `load` to `loads`, but not `contact_arm` to `contacts`
             meant = (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES
             near = near or difflib.get_close_matches(name, meant, n=1, cutoff=0.85)
-            # beside a method of the right name it is a helper
+            # where the method of the right name exists too, this one is a helper
             if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):
                 what = "a method" if callable_ else "an attribute"
                 return (

@@ -1,10 +1,11 @@
-"""Digests of numbers, texts, containers, scenes and functions. They are equal in every process and identify
-studies, so a changed function makes another study.
+"""Digests of numbers, texts, containers, scenes and functions. A digest is the same in every process. Digests
+identify studies: with a changed function, a study is a different one.
 
-A user's function enters by its code (byte code, constants, names), default arguments, closed-over values, and
-the globals that its code names, also in the user's modules. A function or class of an installed package or of
-this one enters by its name, since the study stores the versions. Closed-over values of a function from a
-wrapper, such as `jax.grad`, enter too. Other objects enter by their pickled content.
+The digest of a user's function covers its code (byte code, constants, names), default arguments, closed-over
+values, and the globals that its code names, including those in the user's other modules. A function or class
+of this package or of an installed one is identified by its name, since a study stores the versions of
+packages. The closed-over values of a function from a wrapper, such as `jax.grad`, are covered too. Other
+objects are digested by their pickled content.
 """
 
 import copyreg
@@ -33,7 +34,7 @@ def _hashed(content: object) -> str:
 def _content(
     x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]
 ) -> object:
-    """Return the content of x for a digest. `within`: ids of enclosing objects; `known`: known digests."""
+    """Return the content of x for a digest. `within`: ids of enclosing objects; `known`: memo of digests."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -48,7 +49,7 @@ def _content(
         )
     if _is_formula(x):
         return "formula", type(x).__qualname__, str(x)
-    # functions and classes that refer to each other
+    # end the recursion: functions and classes may refer to each other
     if depth > 20 or id(x) in within:
         return "deeper", type(x).__qualname__
     if (id(x), depth) not in known:
@@ -90,7 +91,7 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Return whether x is a SymPy expression. Its digest is of its text, since SymPy numbers symbols
+    """Return whether x is a SymPy expression. These are digested by their text, since SymPy numbers symbols
     differently in every process.
     """
     sympy = sys.modules.get("sympy")
@@ -120,7 +121,9 @@ def _function(f: FunctionType, of) -> object:
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the content of a name's value; of a user's module, the attributes that the code names."""
+        """Return the content of a name's value; for a user's module, that of the
+        attributes that the code names.
+        """
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))

@@ -1,9 +1,9 @@
 """Caches keyed by scene: by its class, the names that its methods read (`outside_names.py`) and the shapes of
-its parameters, or also by their values.
+its parameters; some caches also by the parameters' values.
 
 Facts that hold at every state of a scene, such as rank and independent speeds, must be known before
-compilation. They are found at a few states, with numbers for the parameters. Reference parameters are the
-numbers for traced parameters.
+compilation. They are determined at a few states, with numbers for the parameters. Reference parameters are
+the numbers used in place of traced parameters.
 """
 
 import sys
@@ -30,22 +30,22 @@ def clear_caches() -> None:
 
     Every scene is traced, probed and compiled again at its next use. Call this after changing values in
     helper functions, modules or classes. Machine code is kept: it depends only on the text of its program,
-    and another thread may run it.
+    and another thread may be running it.
     """
     for name, module in list(sys.modules.items()):
         if name.startswith("jourdain_jax.") and ".native" not in name:
             for value in list(vars(module).values()):
-                # not for modules: this would trigger lazy imports
+                # skip modules: reading them would trigger lazy imports
                 if callable(value) and hasattr(value, "cache_clear"):
                     value.cache_clear()
     jax.clear_caches()
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """Decorate a function of a scene and further keys to run once per class and values, on concrete
-    parameters, even during tracing.
+    """Decorate a function of a scene and further keys so that it runs once per class and parameter values. It
+    gets concrete parameters, even during tracing.
 
-    `of_traced`: a function that is called for scenes with traced parameters, without caching.
+    `of_traced`: a function that is called instead, without caching, for scenes with traced parameters.
     """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
@@ -93,7 +93,7 @@ _latest: list[Values] = []
 
 
 def _asked_about_before(leaves: list, treedef) -> Values | None:
-    """Return the key of the latest scene if its leaves are these objects."""
+    """Return the key of the latest scene if its leaves are the same objects as `leaves`."""
     for known in _latest:
         same = len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves))
         if same and known.structure == (treedef, jax.config.jax_enable_x64):
@@ -108,9 +108,10 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Return a context in which known numbers of `scene` replace traced parameters of its class.
+    """Replace traced parameters by the numbers of `scene` within this context, for
+    scenes of the same structure.
 
-    `varied`: names of parameters (None: all) for which generic numbers near the scene's are used.
+    `varied`: names of the parameters (None: all) that get generic numbers near those of `scene`.
     """
     token = _STAND_IN.set((scene, varied))
     try:
@@ -123,8 +124,8 @@ def with_reference_parameters(scene):
     """Return the scene with generic numbers in place of traced parameters: near the reference, near the
     class's defaults, or near one.
 
-    With generic numbers, a default of zero (a tilt, a rate) hides no term, and two equal defaults are two
-    lengths.
+    Generic numbers keep terms that a default of zero (a tilt, a rate) would hide, and tell two
+    lengths with equal defaults apart.
     """
     leaves, treedef = jax.tree.flatten(scene)
     unknown = [is_traced_type(type(x)) for x in leaves]
@@ -143,7 +144,7 @@ def with_reference_parameters(scene):
 
 
 def _defaults(scene) -> list:
-    """Return the class's default for every leaf of a scene, or None."""
+    """Return the class's default for every leaf of a scene; None for a leaf without one."""
     found: list = []
     for field in fields(scene):
         if field.metadata.get("static", False):
@@ -163,7 +164,7 @@ def _generic(x, near, place: int) -> np.ndarray:
     except (TypeError, ValueError):  # not numbers, or a shape that does not fit
         near = np.full(np.shape(x), np.nan)
     if not all_finite(near):
-        # sample points of a table increase
+        # sorted: sample points of a table must increase
         return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)
     if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
         steps = np.diff(near, append=2 * near[-1] - near[-2])
@@ -172,11 +173,11 @@ def _generic(x, near, place: int) -> np.ndarray:
 
 
 def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
-    """Return the numbers `given`, changed by the fractions `change`, which may have leading axes. A number
-    that is 0 counts as `zero`.
+    """Return the numbers `given`, changed by the fractions `change`, which may have leading axes. A
+    number that is 0 counts as `zero`.
 
-    Separately changed entries of an inertia tensor I may belong to no body. I becomes the tensor of the body,
-    stretched, sheared and rotated by a small matrix E:
+    If the entries of an inertia tensor I were changed separately, the result might belong to no body. Instead
+    the body is stretched, sheared and rotated by a small matrix E:
 
         S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
     """
@@ -204,8 +205,8 @@ def _is_inertia(x: np.ndarray) -> bool:
 
 
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
-    """Decorate a function of a scene and further keys to run once per class and shapes of the parameters, on
-    which alone it depends.
+    """Decorate a function of a scene and further keys that depends only on the class and the shapes of the
+    parameters, so that it runs once for these.
 
     `most`: maximum number of stored results.
     """
@@ -233,7 +234,9 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Return a context with stored results of decorated functions, by function name and first further key."""
+    """Use stored results of decorated functions within this context. `found`: results by
+    function name and first further key.
+    """
     token = _BEFORE.set(found)
     try:
         yield

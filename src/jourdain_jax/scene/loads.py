@@ -1,9 +1,10 @@
-"""Impressed forces: known functions of time, state and parameters, as resultants on bodies or on speeds.
+"""Impressed forces: known functions of time, state and parameters, given as resultants on bodies or as
+generalized forces on speeds.
 
 A load has forces F at the mass centres (`forces`), torques L (`torques`), and generalized forces Q_k on the
 speeds u_k (`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a
-`potential` is conservative and counts in the potential energy V. The work of other loads is integrated along
-the motion.
+`potential` is conservative, and its potential is part of the potential energy V. The work of other loads is
+integrated along the motion.
 """
 
 from typing import Any
@@ -43,7 +44,7 @@ class Load(eqx.Module):
 
 
 class Gravity(Load):
-    """Uniform gravity with its `direction`, which is checked when a scene is probed."""
+    """Uniform gravity. Its `direction` is checked when the scene is probed."""
 
     direction: Vector3
 
@@ -62,8 +63,8 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
 def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) -> Load:
     """Return uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
-    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. Raises ValueError for a
-    direction of another length when the scene is built.
+    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. Raises ValueError when the
+    scene is built if `direction` is not of unit length.
     """
     motion = _motion(motion, "gravity")
     e = checked_real(direction, "direction of gravity", (3,), advice="give a unit vector")

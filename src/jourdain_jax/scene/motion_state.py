@@ -1,8 +1,8 @@
 """The arguments of a scene's methods: poses, or poses with velocities, of all bodies at one instant.
 
-`Pose` (t, q, bodies) is the argument of geometric constraints and contacts. `Motion` adds `u`, `qdot`, inputs
-and velocities, and is the argument of loads, velocity constraints and events. Velocities refer to the mass
-centres, angular velocities are in space components.
+`Pose` (t, q, bodies) is the argument of geometric constraints and contacts. `Motion` also has `u`, `qdot`,
+inputs and velocities; it is the argument of loads, velocity constraints and events. Velocities are those of
+the mass centres; angular velocities are in space components.
 """
 
 from typing import Any

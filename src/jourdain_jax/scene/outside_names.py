@@ -1,14 +1,14 @@
 """Names that methods read from outside their arguments.
 
-As everywhere in JAX, a method is traced once, and values that are not fields of the scene become constants of
-the trace. They belong to the structure of the scene and are compared at each call. The compared values are
-the members of the class, and the global names and variables of enclosing functions that a method reads
-itself:
+As everywhere in JAX, a method is traced once, and values that are not fields of the scene become constants
+of the trace. They belong to the structure of the scene and are compared at each call. The compared values
+are the members of the class, and the global names and variables of enclosing functions that a method
+itself reads:
 
 - numbers, texts and tuples of them are compared by type and value, functions by the identity of the function
   and of its code. So `g = 1.62` in a later cell of a notebook, or `%autoreload`, takes effect;
-- modules, classes, and functions wrapped by Python, JAX or another package are compared by identity;
-  attributes of functions, modules and classes are constants;
+- modules, classes, and functions wrapped by Python, JAX or another package are compared by identity; their
+  attributes count as constants;
 - arrays, containers and objects with state raise an error, since their changes could not be noticed.
 
 Values that helper functions read are not compared. After `clear_caches` every scene is traced again.
@@ -54,8 +54,8 @@ class StatefulError(ValueError):
 
 
 class NamesRead:
-    """Names that methods of classes, or functions, read: a pytree without leaves, whose structure changes
-    with their values.
+    """The names that methods of classes, or functions, read. It is a pytree without leaves, whose structure
+    changes when the value of one of the names changes.
     """
 
     def __init__(self, roots: tuple[type | Callable, ...], strict: bool):
@@ -67,7 +67,7 @@ class NamesRead:
         return names_read, self._roots
 
     def now(self) -> tuple["NamesRead", int]:
-        """Return the names with their present values, and a version number; equal contents have equal
+        """Return the names with their current values, and a version number; equal contents have equal
         numbers. Raises ValueError if a name now refers to an object with state.
         """
         found = [x for look in self._looks for x in look()]
@@ -98,7 +98,7 @@ class NamesRead:
         seen = [x for look in looks for x in look()]
         content += map(_Same, looks[-1]())
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
-        # last, so that a value that raises here raises again at the next call
+        # set last: a value that raises an error above raises it again at the next call
         self._looks, self._seen = looks, seen
 
 
@@ -116,8 +116,8 @@ def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
 
 
 def now_read_by(function: Callable) -> Hashable | None:
-    """Return the present values of the names that a function reads. Return None if its trace must not be
-    stored: one of the values has state, or the argument is no function.
+    """Return the current values of the names that a function reads. Return None if its trace must not be
+    stored: one of the values has state, or the argument is not a function.
     """
     try:
         return names_read(function, strict=True).now() if is_function(function) else None
@@ -126,7 +126,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 
 def is_function(x) -> bool:
-    """Return whether x has code that may read names: a function, a method, or what wraps one."""
+    """Return whether x has code that may read names: a function, a method, or a wrapper of one."""
     return isinstance(x, FunctionType | MethodType | partial) or callable(attribute(x, "__wrapped__"))
 
 
@@ -144,8 +144,8 @@ class _Same:
 
 
 def _key(x: Any, whose: str = "", name: str = "") -> Hashable:
-    """Return the key of a value; for a value with state, its identity. If a method `whose` reads it by a
-    `name`, a value with state raises StatefulError.
+    """Return the key by which a value is compared; for a value with state, its identity. If `whose`, a
+    method, reads the value as `name`, a value with state raises StatefulError.
     """
     try:
         return _content(x)

@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, all_finite, as_real, described, ha
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array. Other values stay unchanged, and `check_parameters`
-    refuses them with the field's name.
+    """Return a parameter as a floating-point array. Other values stay unchanged; `check_parameters` rejects
+    them with the field's name.
     """
     try:
         return as_real(value)
@@ -89,8 +89,8 @@ def check_parameters(scene) -> None:
 
 
 def stacked_parameters(scene) -> str:
-    """Return a sentence about parameters with one axis more than their defaults, as in a batch of scenes.
-    Without such parameters it is empty.
+    """Return an error message about parameters with one axis more than their defaults, as in a batch of
+    scenes; empty if there are none.
     """
     shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
     usual = {name: np.shape(value) for name, value in _defaults(type(scene))}

@@ -4,9 +4,9 @@ and each principal moment is at most the sum of the other two.
     I = tr(S) 1 - S,      S = A A'       A = [exp(d1) s12 s13; 0 exp(d2) s23; 0 0 exp(d3)]
 
 S is the second moment of the mass about the mass centre, positive definite for every body that is not flat. A
-is its upper triangular Cholesky factor. S does not depend on mass and mass centre: it is their block of the
-body's pseudo-inertia. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022)
-2700, eqs. (10)-(13).
+is its upper triangular Cholesky factor. Mass and mass centre are the other parts of the body's pseudo-inertia
+and do not affect S. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022) 2700,
+eqs. (10)-(13).
 """
 
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
 
     `symmetric`: return four numbers, for a body that is symmetric about its x-z plane. **Raises** ValueError
     for another shape, an asymmetric matrix, nonzero Ixy or Iyz with `symmetric`, and moments of a flat or
-    impossible body. Traced matrices give NaN instead.
+    impossible body. For a traced matrix of such a body the result is NaN.
     """
     I = checked_real(
         inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal moments, kg m^2"
@@ -73,7 +73,7 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
     S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
     if known_numbers(I).size:
         _check(np.asarray(I), np.asarray(S), symmetric)
-    # A is upper triangular: the lower factor of S with reversed rows and columns, reversed back
+    # A is upper triangular: reverse rows and columns of S, take the lower factor, reverse it back
     A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
     d = jnp.log(jnp.diag(A))
     return jnp.concatenate([d, A[0, 2:] if symmetric else jnp.stack([A[0, 1], A[1, 2], A[0, 2]])])

@@ -1,5 +1,5 @@
-"""Text of results in a console and in a notebook: numbers, tables and matrices. Shapes stand for traced
-values.
+"""Text of results in a console and in a notebook: numbers, tables and matrices. Traced values are shown by
+their shapes.
 """
 
 import dataclasses
@@ -37,14 +37,15 @@ _picture: Callable = lambda scene: ""
 
 
 def show_scenes_with(picture: Callable) -> None:
-    """Show the HTML of `picture(scene)` in notebooks; a higher layer sets this function."""
+    """Set the function whose HTML, `picture(scene)`, notebooks show below a scene; a higher layer calls this.
+    """
     global _picture
     _picture = picture
 
 
 def scene_text(scene) -> str:
-    """Return a scene as its constructor call: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; large
-    arrays by their shape.
+    """Return a scene as its constructor call: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`. Large
+    arrays are shown by their shape.
     """
     shown = []
     for field in (field for field in dataclasses.fields(scene) if field.repr):

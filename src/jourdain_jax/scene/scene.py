@@ -50,8 +50,8 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class Scene(eqx.Module):
-    """Base class of all scenes. Subclass it and define `coordinates`, `bodies`, and whatever else the scene
-    needs.
+    """Base class of all scenes. Subclass it and define `coordinates`, `bodies`, and whatever else the
+    scene needs.
 
     Class attributes (or properties, where they depend on a static field such as a number of bodies)
 
@@ -68,11 +68,11 @@ class Scene(eqx.Module):
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
     As everywhere in JAX, methods are traced once, and values from outside the fields of the scene become
-    constants. A method may itself read global names and variables of an enclosing function. If they hold
-    numbers, texts, tuples of these or functions, the next call notices a change, also of a method or by
-    `%autoreload`. If they hold arrays, lists, dictionaries or objects with state, the scene raises an error;
-    make them parameters or static fields. Call `jj.clear_caches()` after other changes: of values that helper
-    functions read, of attributes of modules and classes, and of files.
+    constants. A method may itself read global names and variables of an enclosing function. If their values
+    are numbers, texts, functions or tuples of these, the next call notices a change. It also notices a
+    changed method, for example after `%autoreload`. If they are arrays, lists, dictionaries or objects with
+    state, the scene raises an error; make them parameters or static fields. Call `jj.clear_caches()` after
+    changing anything else: values that helper functions read, attributes of modules and classes, or files.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -85,7 +85,7 @@ class Scene(eqx.Module):
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
     _may_switch: ClassVar[bool] = False  # whether the methods mention friction
-    _read: NamesRead = eqx.field(init=False, repr=False)  # a change of these values makes another scene
+    _read: NamesRead = eqx.field(init=False, repr=False)  # a change of these values makes a different scene
     switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts with friction
 
     def __init_subclass__(cls, **options):
@@ -144,17 +144,17 @@ class Scene(eqx.Module):
         return None
 
     def gauge(self, pose: Pose) -> Scalar | None:
-        """Return a function S (J s) of a `pose`, or None. Its rate is subtracted from the Lagrangian:
-        L = T - V - dS/dt.
+        """Return a function S (J s) of a `pose`, or None. Its rate is subtracted from the Lagrangian: L = T
+        - V - dS/dt.
 
-        The motion does not depend on S, but the error of integrators with a discrete Lagrangian does. S shows
-        how much.
+        S does not change the exact motion, but it changes the error of integrators with a discrete
+        Lagrangian. Use it to measure this effect.
         """
         return None
 
     def prescribed(self, t: Scalar) -> Mapping[str, Scalar]:
-        """Return prescribed coordinates at time t (s), name -> value. The multiplier of such a constraint is
-        the force of the actuator.
+        """Return prescribed coordinates at time t (s), name -> value. Each is a constraint, whose multiplier
+        is the force of the actuator.
         """
         return {}
 
@@ -177,15 +177,14 @@ class Scene(eqx.Module):
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
         """Return named events at a `motion`: values that are positive while the motion may continue. The
         motion stops where a value falls through zero; beyond that the value may be NaN. A value that starts
-        at zero and rises is no event. Return a `jj.Event` instead of a value to let the motion continue.
+        at zero and rises is not an event. Return a `jj.Event` instead of a value to let the motion continue.
 
-        The first of several events in one step counts. A value may fall through zero and rise again within
-        one step. Such an event is found if a relation in it (`<`, `where`, `abs`, ...) changes. Default
-        solvers also find it if the cubic through values and rates at the ends of the step is negative. Other
-        adaptive solvers find it if the dense output is negative at one of three times. Otherwise a smooth dip
-        of an event's value, if shorter than the longest step, may be missed. So may a condition such as
-        `jnp.linalg.norm(x) < r` that holds for less time. Use values that fall only once, or a smaller
-        `max_step`.
+        If several events occur in one step, the first counts. A value may also fall through zero and rise
+        again within one step. Such a dip is found if a relation in the value (`<`, `where`, `abs`, ...)
+        changes. Default solvers also find it if the cubic through values and rates at the ends of the step
+        becomes negative; other adaptive solvers, if the dense output is negative at one of three times. Other
+        dips shorter than the longest step may be missed, and so may a condition such as `jnp.linalg.norm(x) <
+        r` that holds only briefly. Use values that fall only once, or a smaller `max_step`.
         """
         return {}
 
@@ -194,8 +193,8 @@ class Scene(eqx.Module):
         return {}
 
     def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
-        """Return shapes of bodies at a `pose`, by name, for pictures only. The name `""` holds shapes fixed
-        in the inertial frame. See `jj.Visual`.
+        """Return shapes of bodies at a `pose`, by name, for pictures only. Shapes under the name `""` are
+        fixed in the inertial frame. See `jj.Visual`.
 
         A body that is not listed is drawn from its `outline`, its contacts, or its inertia.
         """
@@ -258,7 +257,7 @@ def vectors_named(
 
 
 def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, Labels]:
-    """Return the result of `Scene.named`, with the entries of q and u in lists."""
+    """Return the result of `Scene.named`, with the entries of q and u as lists."""
     coordinates, speeds = scene.coordinate_names, scene.speed_names
     q, u = scene.coordinates.reference().tolist(), [0.0] * len(speeds)
     given: list[str] = []
@@ -319,12 +318,14 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
 def _vector(entries: list) -> Float[Entries, "entries"]:
     if array_module(entries) is jnp:
         return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
-    # one conversion: no small programs to compile
+    # convert once, on NumPy: nothing to compile
     return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())
 
 
 def _names_read(kind: type[Scene], *functions: Callable) -> NamesRead:
-    """Return the names that the methods of the scene's own classes and the functions read."""
+    """Return the names read by the functions and by the methods of the scene's class and its bases
+    below `Scene`.
+    """
     return names_read(*(owner for owner in kind.__mro__ if owner not in Scene.__mro__), *functions)
 
 

@@ -6,7 +6,7 @@ On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second d
     s(t) = a v_k + b v_k+1 + ((a^3 - a) m_k + (b^3 - b) m_k+1) h^2/6
     h_k-1 m_k-1 + 2 (h_k-1 + h_k) m_k + h_k m_k+1 = 6 ((v_k+1 - v_k)/h_k - (v_k - v_k-1)/h_k-1)
 
-The third derivative is continuous at the second and the last but one knot ("not a knot"). A piecewise linear
+The third derivative is continuous at the second and the second-last knot ("not a knot"). A piecewise linear
 curve is no substitute: its second derivative is zero between knots, so its motion has no inertia force.
 """
 
@@ -20,8 +20,8 @@ from jourdain_jax.calculus.reals import all_finite, checked_real, known_numbers,
 
 
 class Spline(eqx.Module):
-    """A twice continuously differentiable function of time through `values` at the times `ts`; linear beyond
-    the ends.
+    """A twice continuously differentiable function of time through `values` at the times `ts`; linear
+    beyond the ends.
 
         class Cart(jj.Scene):
             ...
@@ -31,8 +31,9 @@ class Spline(eqx.Module):
                 return {"x": self.drive(t)}
 
     **Arguments**
-    - `ts`: knots, s, increasing; `values`: one number per knot. Two of them give a line, three a parabola,
-      more a cubic spline.
+
+    - `ts`: knots, s, increasing; `values`: one number per knot. Two knots give a line, three a parabola, more
+      a cubic spline.
 
     It is differentiable with respect to `values` and `ts`. It can be a field of a scene, a value in its
     methods, or an input. For samples of a smooth motion at intervals h its error is of order h^4.

@@ -1,6 +1,8 @@
-"""Checked results of a scene's methods, or a ValueError that names the method and the expected result.
+"""Calls of a scene's methods with checks of their results. A wrong result raises a ValueError that names the
+method and the expected result.
 
-The checks read kinds and shapes, which are known during tracing, so compiled programs contain none of them.
+The checks read types and shapes only. Both are known during tracing, so the checks add nothing to
+compiled programs.
 """
 
 from collections.abc import Iterable, Mapping
@@ -40,7 +42,8 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
 
 def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
     """Return the rates of all coordinates."""
-    directions = 2 * len(scene.switching.contacts)  # directions of slip come last, and are constant
+    # directions of slip are the last coordinates, with zero rates
+    directions = 2 * len(scene.switching.contacts)
     names = scene.coordinate_names.entries[: len(scene.coordinate_names) - directions]
     rates = checked_real(
         scene.coordinate_rates(t, q, u),
@@ -115,7 +118,7 @@ def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """Return values of the scene's own velocity constraints that hold any force."""
+    """Return values of the scene's own velocity constraints, except those that may slip."""
     given = _dictionary(scene, "velocity_constraints", (motion,), '{"edge": value}')
     always = {name: value for name, value in given.items() if not isinstance(value, HeldRow)}
     _declared(scene, given.keys() - always, "velocity_constraints", "holds=")
@@ -132,7 +135,7 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
 
 
 def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
-    """Return the velocity constraints that hold until their force exceeds a limit, by name."""
+    """Return the velocity constraints that slip if their force exceeds a limit, by name."""
     if not scene.switching.rows:
         return {}
     return held_rows(scene.velocity_constraints(motion), loads_of(scene, motion))
@@ -239,7 +242,9 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
 def _numbers(
     scene: Scene, method: str, at, example: str, what: str, advice: str, shape: Shape | None = ()
 ) -> dict[str, Array]:
-    """Return a method's result at a time, pose or motion: numbers by name, or arrays of another `shape`."""
+    """Return a method's result at a time, pose or motion: numbers by name, or arrays. `shape`: of each
+    value; None: any.
+    """
     return _checked(scene, _dictionary(scene, method, (at,), example), what, advice, shape)
 
 

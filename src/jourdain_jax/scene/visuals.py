@@ -1,7 +1,7 @@
 """Shapes of bodies, in the body frame, for pictures only.
 
-A scene states them in `visuals(self, pose)`. Bodies without shapes are drawn from their `outline`, the shapes
-of their contacts, or their inertia.
+A scene returns them from `visuals(self, pose)`. Bodies without shapes are drawn from their `outline`, the
+shapes of their contacts, or their inertia.
 """
 
 import os
@@ -33,7 +33,7 @@ from jourdain_jax.scene.contact.grounds import tangents_of
 
 
 class Faces:
-    """Corners (points, 3) and faces of a mesh, as known numbers; compared by identity."""
+    """Corners (points, 3) and faces of a mesh, as concrete numbers; meshes are compared by identity."""
 
     def __init__(self, corners: np.ndarray, polygons: tuple[Indices, ...]):
         self.corners, self.polygons = corners, polygons
@@ -55,11 +55,11 @@ class Visual(eqx.Module):
     All constructors take
 
     - `at`: (3,) in m, the middle of the shape in the body frame (default: the mass centre).
-    - `turn`: (3, 3), from the axes of the shape to the body axes (default: the same axes).
+    - `turn`: (3, 3), rotation from the axes of the shape to the body axes (default: the identity).
     - `colour`: "#rrggbb" (default: the body's, from a palette). `opacity`: 0 to 1.
 
     Under the name `""` in `visuals`, shapes are fixed in the inertial frame. Positions, rotations and the
-    points of lines may change with the pose; sizes are taken at the first saved time.
+    points of lines may change with the pose; the sizes at the first saved time hold for the whole picture.
 
     **Examples**
 
@@ -161,8 +161,8 @@ class Visual(eqx.Module):
         """Return a body with flat faces.
 
         `vertices`: (points, 3) in m; `faces`: for each face a list of vertex indices, anticlockwise seen from
-        outside. Both are known numbers. `scale`: one factor or three, which may depend on parameters; `look`:
-        as for all shapes.
+        outside. Both must be concrete numbers. `scale`: one factor or three, which may depend on parameters;
+        `look`: as for all shapes.
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
