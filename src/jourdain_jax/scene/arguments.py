@@ -58,8 +58,7 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """Return `scene`, or the scene of a model. Raises ValueError for any other value, such as a scene class.
-    """
+    """Return `scene`, or the scene of a model. Raises ValueError for any other value, such as a scene class."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, BuiltFor):
@@ -83,7 +82,7 @@ def as_rolling(scene, what: str) -> Scene:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
         raise ValueError(
             f"`{what}` supports only rolling contacts and constraints that never slip, but {named} of "
-                f"`{type(scene).__name__}` may slip; remove the friction there"
+            f"`{type(scene).__name__}` may slip; remove the friction there"
         )
     return scene
 

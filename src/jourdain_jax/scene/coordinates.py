@@ -177,5 +177,6 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if name == "t" and kind != "input":
             raise ValueError(f"{kind} name `t` is reserved for time (`motion.t`); choose another")
         if name in ("array", "slots", "keys"):
-            raise ValueError(f"{kind} name `{name}` is reserved: `q.{name}` already has a meaning; choose "
-                "another")
+            raise ValueError(
+                f"{kind} name `{name}` is reserved: `q.{name}` already has a meaning; choose another"
+            )

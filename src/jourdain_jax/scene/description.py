@@ -70,8 +70,8 @@ def check_description(scene, base: Any) -> None:
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
             f"`{kind.__name__}` defines speeds ({', '.join(scene.speeds.entries)}) but not the rates of its "
-                "coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
-                "coordinates"
+            "coordinates; define `coordinate_rates(self, t, q, u)`, which returns the rates of all "
+            "coordinates"
         )
     _check_counts(scene)
     for name in scene.speed_names.entries:
@@ -105,8 +105,7 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """Return an error message about a misspelt method, attribute or field of a class; empty if there is none.
-    """
+    """Return an error message about a misspelt method, attribute or field of a class; empty if there is none."""
     own = {field.name for field in fields(kind)}
     owners = [owner for owner in kind.__mro__ if owner not in base.__mro__]
     read = {
