@@ -461,7 +461,8 @@ CLASSES = {
         "`example` of `Described` names `x_rat`, which is not a coordinate or speed; did you mean `x_rate`"
     ),
     "described(speeds=jj.speeds('a b c'))": (
-        "`Described` defines speeds (a, b, c) but not the rates of its coordinates; define `coordinate_rates(self, t, q, u)`"
+        "`Described` defines speeds (a, b, c) but not the rates of its coordinates; define "
+        "`coordinate_rates(self, t, q, u)`"
     ),
     "described(speeds='a b')": (
         "`speeds` of `Described` is the text 'a b', expected names; write speeds = jj.speeds('a b c')"

@@ -63,14 +63,15 @@ class Accelerations(eqx.Module):
     udot: Speeds
     # lambda of minimum norm: the constraint force on the speeds is A' lambda
     multipliers: Float[Array, "rows"]
-    # columns with A' lambda = 0, which do not affect the motion; a row whose multiplier is unique has zeros
+    # columns of multipliers with A' lambda = 0, which do not affect the motion; the row of a unique
+    # multiplier is zero
     spare: Float[Array, "rows rows"]
     constraint_force: Speeds  # A' lambda = M udot + h - Q
     rank: Count  # of A at this state
-    # of scaled A, the last one within its usual rank (1 without constraints), or a smaller pivot of the
-    # reduction
+    # the last singular value of scaled A within its usual rank (1 without constraints), or the reduction's
+    # pivot if that is smaller
     smallest_singular_value: Scalar
-    residual: Scalar  # |A udot + drift| in scaled rows; large where constraints contradict each other
+    residual: Scalar  # |A udot + drift| in scaled rows; large if constraints contradict each other
     applicable: Flag  # whether this reduction works at this state
 
 
@@ -89,7 +90,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
 
 
 def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
-    """Return a reduction from its short name, or the object itself; the null space by QR for None."""
+    """Return a reduction from its short name, or the object itself; `NullSpaceQR()` for None."""
     if reduction is None:
         return NullSpaceQR()
     if isinstance(reduction, str):
@@ -108,8 +109,8 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
     if not valid or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
         raise ValueError(
-            f"`independent` is {chosen}, expected indices of {where}, each once; or give the reduction "
-            "by its name"
+            f"`independent` is {chosen}, expected indices of {where}, each at most once; or give the "
+            "reduction by its name"
         )
     return reduction
 
@@ -139,13 +140,13 @@ def accelerations(
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt",
       "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical sizes of the constraint rows; a row that is much smaller counts as lost (default: the
-      scene's).
+    - `usual`: typical lengths of the constraint rows; a row at the round-off of its typical length counts as
+      zero (default: the scene's typical lengths).
 
     It works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
-    `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError for
-    an unknown reduction, and for known parameters that give impossible bodies, loads or planes. Eqs. (41),
-    (68)-(70).
+    `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError
+    for an unknown reduction, and for known parameters that give impossible bodies, loads or planes. Eqs.
+    (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f

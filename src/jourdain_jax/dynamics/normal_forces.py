@@ -4,10 +4,12 @@
     sum_i N_i (p_i - o) x n_i  = sum_j (r_j - o) x f_j + T_j
 
 j: the carried bodies, i: the contacts that touch them, o: any point. F_j: impressed forces, R_j: constraint
-forces, T_j: moments of inertia, loads and constraints. The coordinates may impose more than contacts can, as
-a guide keeps a disc upright. So the forces are balanced first, by least squares, then the moments as far as
-the forces leave freedom. The remaining freedom has minimum norm. Normal forces on a plane thus always sum to
-the total load of the bodies.
+forces, T_j: moments of inertia, loads and constraints.
+
+Coordinates may impose motions that contacts alone cannot enforce, like a guide that keeps a disc upright.
+Therefore the N_i satisfy first the balance of forces, by least squares, then, with the remaining freedom, the
+balance of moments. If the N_i are still not unique, they have minimum norm. On a plane the normal forces thus
+always sum to the total load of the bodies.
 """
 
 import equinox as eqx

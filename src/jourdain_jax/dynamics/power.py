@@ -7,12 +7,12 @@
                 + sum mdot v.v/2 + omega.(dI/dt omega)/2     masses and inertias that change
 
 Constraints that do work are prescribed, nonhomogeneous or nonlinear. R, T: constraint force and torque on a
-body; v_0, omega_0: its velocities at u = 0. Matter that joins a body has the velocity of the body. Terms that
-are zero at every state by the scene's structure are not computed.
+body; v_0, omega_0: its velocities at u = 0. Matter that joins a body is assumed to have the velocity of the
+body. Terms that are zero at every state by the scene's structure are not computed.
 
 Inputs f count as constant here; their rates enter constraints through the accelerations. If the potential V_i
-of a load depends on inputs, they also do the work dV_i/df . df/dt. Inputs may jump, so it is computed without
-their derivative (`rate_of_work`, `stored_by_inputs`):
+of a load depends on inputs, the inputs also do the work dV_i/df . df/dt. Since inputs may jump, this work is
+computed without df/dt (`rate_of_work`, `stored_by_inputs`):
 
     W = int (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)
 
@@ -37,11 +37,11 @@ from jourdain_jax.structure.structure import Structure, structure_of
 
 
 class Power(eqx.Module):
-    """Power in W by origin; positive where it adds to T + V."""
+    """Power in W by origin; positive if it increases T + V."""
 
     loads: Scalar  # of loads without a potential
     rows: Scalar  # of constraints that do real work
-    driven: Scalar  # of drives of poses given as functions of time
+    driven: Scalar  # of drives that move poses as functions of time
     potential: Scalar  # explicit rate of potentials that depend on time
     inertia: Scalar  # of changing masses and inertias
 
@@ -82,7 +82,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 def rate_of_work(
     scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices
 ) -> Scalar:
-    """Return the integrand of the work W, in W.
+    """Return the integrand of the work of the module's last formula, in watts.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. They contribute by their forces.
     Their stored energy (`stored_by_inputs`) is added to the integral.

@@ -131,8 +131,8 @@ def contact_forces(
 
     The tangential force is the multiplier of the no-slip constraints. With `height="row"` the normal force is
     the multiplier of the height constraint. With `height="coordinates"` it follows from the balance of forces
-    and moments (S1) of the bodies that the contact carries. For forces, with sums over all contacts of these
-    bodies and over these bodies: `sum N n = sum (m a - F - R)`.
+    and moments (S1) of the bodies that the contact carries. The balance of forces is `sum N n = sum (m a - F
+    - R)`, with sums over all contacts of these bodies, and over the bodies.
 
     If the balance does not determine the normal force (four wheels on a plane), the force has minimum norm,
     and `determined` is False. `determined` is also False if a moment remains that no contact can exert, such
@@ -148,7 +148,7 @@ def contact_forces(
     total = newton_residual(scene, t, q, u, accelerations.udot, inputs)
     size = _size_of_forces(scene, motion, total.linear)
     margin = rank_cutoff(size.dtype) * size
-    # exerted by the choice of coordinates
+    # forces and torques that the choice of coordinates imposes
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))
     spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", accelerations.spare, part), unit[0])
     positions = of_bodies(motion, "position")

@@ -1,19 +1,21 @@
 """Ignorable coordinates, found by probes, and the reduced Appell equations (42) without them (S9).
 
-A coordinate is *cyclic* if its rate is no privileged velocity and these quantities do not depend on it: B and
-b of `qdot = B y + b`, the partial velocities beta and gamma, the inertias R I R' of the bodies, impressed
+A coordinate is *cyclic* if its rate is not a privileged velocity and these quantities do not depend on it: B
+and b of `qdot = B y + b`, the partial velocities beta and gamma, the inertias R I R' of the bodies, impressed
 forces and torques, forces on speeds, and the potential's gradient. All are taken in the inertial frame and in
 the privileged velocities y. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if
 the privileged accelerations do not depend on it, which is a weaker condition.
 
-Both kinds are fixed at the reference, and the system is integrated in the other, *kept* coordinates k alone:
+Coordinates of both kinds are dropped: they are fixed at the reference, and only the other coordinates k,
+which are *kept*, are integrated:
 
     dk/dt = B_k(t, k) y + b_k(t, k),     dy/dt = yddot(t, k, y)
 
-The dropped coordinates d follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in
-groups: the disc's x and y need its yaw. `simulate` integrates all coordinates instead. Quadrature cannot
-recover a coordinate if its own rate or a kept rate depends on it (quaternions, the sleigh's heading); it is
-kept. Source: Wang and Pao (2003), eq. (42).
+The dropped coordinates d follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`.
+They are recovered in groups, since the rates of some depend on others: the disc's x and y need its yaw.
+`simulate` integrates all coordinates instead. A coordinate is kept if its own rate or a kept rate depends
+on it (quaternions, the sleigh's heading), because quadrature cannot recover it. Source: Wang and Pao
+(2003), eq. (42).
 """
 
 from dataclasses import dataclass
@@ -97,10 +99,10 @@ def _named(scene: Scene, chosen) -> Labels:
 
 @once_per_values
 def dependence(scene: Scene) -> Dependence:
-    """Return the dependence of quantities on coordinates, by displacement of each coordinate alone at random
+    """Return the dependence of quantities on coordinates, found by displacing each coordinate alone at random
     states. Constraints must be affine in the speeds.
 
-    The states are off the geometric constraints: otherwise a coordinate that is constant on these would seem
+    The states are off the geometric constraints: otherwise a coordinate that is constant on them would seem
     to have no influence.
     """
     generator = np.random.default_rng(0)
@@ -162,7 +164,7 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     forces = [part for of in both for part in (of.force, of.torque, of.direct @ C)]
     return {
         "rates": motion.qdot.array,
-        # y, constant in the coordinates, gives free motion a size
+        # y does not depend on the coordinates; it sets the size to compare with where accelerations are zero
         "accelerations": jnp.concatenate([found.udot[chosen], y]),
         "B and b": jnp.concatenate([rates.B.ravel(), rates.b, C.ravel(), rates.c]),
         "beta and gamma": jnp.concatenate([velocities, beta.ravel(), gamma.ravel()]),
@@ -246,7 +248,7 @@ def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y) -> Flo
     """
     structure = structure_of(scene)
     places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]
-    # dropped coordinates are at the reference
+    # dropped coordinates stay at the reference
     q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)
     known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
     return accelerations_of(scene, known, t, q)[1].udot[jnp.array(structure.independent, jnp.int32)]

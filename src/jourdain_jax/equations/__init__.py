@@ -2,8 +2,8 @@
 
     kinematics.py -> virtual_power.py -> rows.py -> reductions.py -> gibbs_appell.py, lagrange.py, minimal.py
 
-Every formula of docs/theory.md stands beside its code here or in `dynamics`. Contacts that switch:
-`contact_laws.py`, `phases.py`, `impacts.py`. Open `kinematics.py` first.
+The code of every formula of docs/theory.md is here or in `dynamics`, beside the formula. Contacts that
+switch: `contact_laws.py`, `phases.py`, `impacts.py`. Open `kinematics.py` first.
 """
 
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function

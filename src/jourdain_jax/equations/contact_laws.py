@@ -1,4 +1,5 @@
-"""Coulomb's law at all contacts, with their forces and impulses, by small systems unrolled to scalars.
+"""Coulomb's law at all contacts: their forces and impulses, from small systems of equations that are
+unrolled to scalars.
 
 Accelerations of the gap and of slip are `G L + b` with the forces L. Changes of speeds depend on impulses in
 the same way, so one law serves both.
@@ -21,10 +22,11 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar
 
-# Gauss-Seidel sweeps per contact; Newton steps of one contact, one more for each further contact
+# SWEEPS: Gauss-Seidel sweeps per contact; STEPS: Newton steps for one contact, one more for each
+# further contact
 SWEEPS, STEPS = 4, 5
-SLOW = 5e-6  # m/s: the direction of slower slip turns as at this speed
-ROUND_OFF = 1e-9  # of responses
+SLOW = 5e-6  # m/s: slower slip changes its direction as if it had this speed
+ROUND_OFF = 1e-9  # relative, of responses
 LEAST_SLIP = 1e-8  # m/s: round-off of speeds that impulses change
 LEAST_PIVOT = 1e-12  # relative to the diagonal entry before elimination
 
@@ -34,7 +36,7 @@ def solved(
 ) -> list[Float[Array, "columns"]]:
     """Return `K^-1 right`, by elimination in the order of the rows.
 
-    `vanishes`: whether a pivot may vanish. An unknown with a vanishing pivot becomes zero, such as the force
+    `vanishes`: whether a pivot may vanish. The unknown of a vanishing pivot is set to zero, such as the force
     across a plane in which all bodies move.
     """
     count, inverses = len(K), []
@@ -100,7 +102,9 @@ def responses(
     modes: Modes,
     friction: Float[Array, "contacts"],
 ) -> Float[Array, "rows columns"]:
-    """Return the forces at all contacts in their modes, one column for each column of b, by `system`."""
+    """Return the forces at all contacts in their modes, one column for each column of b, from the equations
+    of `system`.
+    """
     K, s = system(G, modes, friction)
     return forces(K, -s[:, None] * b)
 
@@ -168,7 +172,7 @@ def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "con
 
 
 def _scales(G: Float[Array, "rows rows"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
-    """Return 1/G_nn and 1/tr G_tt of each contact, zero for zero."""
+    """Return 1/G_nn and 1/tr G_tt of each contact; 0 where the denominator is 0."""
     sizes = jnp.diagonal(G).reshape(-1, 3)
     sizes = jnp.stack([sizes[:, 0], sizes[:, 1] + sizes[:, 2]])
     return tuple(jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1.0), 0.0))
@@ -191,8 +195,8 @@ def _improved(
 ) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
     """Return forces and directions of slip after one step of Newton's method.
 
-    The unknowns are P and the angles of the unknown directions e. They satisfy n.w_t = 0, where n is e turned
-    by a right angle.
+    The unknowns are the forces P and the angles of those directions e that are unknown. The equation of an
+    angle is n.w_t = 0, where n is e rotated by a right angle.
     """
     (K, s), e = system(law.G, modes, law.friction), modes.direction
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
@@ -227,7 +231,7 @@ def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, 
 
 
 def unit(x: Float[Array, "*contacts 2"]) -> Float[Array, "*contacts 2"]:
-    """Return unit vectors; zero for zero."""
+    """Return vectors divided by their lengths; a zero vector stays zero."""
     square = jnp.sum(x * x, axis=-1, keepdims=True)
     return x / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
@@ -252,13 +256,13 @@ def impulse(
     """Return the impulse P at a contact that strikes with the speeds w, by the law `kind`; `restitution`: e.
 
         dw/ds = G (1, -mu e_t)      s: normal impulse,  e_t: direction of slip, along w_t
-
         newton       until w_n+ = -e w_n
         poisson      until s = (1 + e) s_c             s_c: s at the end of compression, w_n = 0
         energetic    until W_r = -e^2 W_c              W_c, W_r: work of s in compression and restitution
 
-    Once slip has stopped, the contact sticks, or slips along the limit direction. The speeds change linearly
-    before and after this. P is NaN if slip would turn before. Source: W. J. Stronge, Impact Mechanics (2000).
+    When slip stops, the contact sticks from then on, or slips along the limit direction. The speeds are
+    linear in s before and after that instant. P is NaN if the direction of slip would change before it.
+    Source: W. J. Stronge, Impact Mechanics (2000).
     """
     at_rest = coulomb(_one(G, friction))  # for a unit rise of w_n
     by_stop, sticks = at_rest.P[0], at_rest.modes.rolls[0] > 0
@@ -270,7 +274,7 @@ def impulse(
     first, slowing = rates[0], -(e @ rates[1:])
     at_stop = jnp.where(slowing > 0, e @ w[1:] / jnp.where(slowing > 0, slowing, 1.0), jnp.inf)
     stops = jnp.where(moving, at_stop, 0.0)  # normal impulse when slip stops
-    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n then
+    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n when slip stops
 
     def reached(goal: Scalar) -> Scalar:
         """Return the normal impulse at which w_n reaches the value `goal`."""

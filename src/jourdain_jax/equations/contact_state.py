@@ -55,7 +55,7 @@ class At:
         return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
 
     def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
-        """Return the response of contact i while the others stay in `modes` (default: the present ones)."""
+        """Return the response of contact i while the others stay in `modes` (default: the current ones)."""
         modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
         others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
         right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
@@ -69,7 +69,8 @@ class Alone(NamedTuple):
 
     G: Float[Array, "3 3"]
     b: Float[Array, "3"]
-    borne: Float[Array, "rows 4"]  # forces of all contacts per unit force of this one, and without it
+    # forces of all contacts: three columns per unit force of this one, one without it
+    borne: Float[Array, "rows 4"]
 
     def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "contacts 3"]:
         """Return the forces of all contacts if contact i has the force `own`."""

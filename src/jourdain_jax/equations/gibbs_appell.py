@@ -70,7 +70,7 @@ class GibbsAppell(eqx.Module):
     def accelerations(
         self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows
     ) -> Reduced:
-        """Return accelerations that satisfy the constraint `rows`; of `equations`, they use only Q."""
+        """Return accelerations that satisfy the constraint `rows`. Only Q of `equations` is used."""
         problem = scaled(equations, rows)
         split = Partition(problem.A, self.independent)
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()

@@ -82,10 +82,10 @@ def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "cont
 class After:
     """Speeds, modes and directions of slip after an event of contact i.
 
-    If contacts strike, impulses of impact act; otherwise, where a slip ends, impulses remove the rest of it.
-    Then Coulomb's law for accelerations decides which contacts without slip open, stick or begin to slip. If
-    it has no solution, or an impact would gain energy, the mode of contact i is a negative number for the
-    reason.
+    If contacts strike, impulses of impact act; otherwise, where a slip ends, impulses remove the remaining
+    slip. Then Coulomb's law for accelerations decides which contacts without slip open, stick or begin to
+    slip. If it has no solution, or an impact would gain energy, the mode of contact i becomes a negative
+    number that tells the reason.
     """
 
     def __init__(self, at: At, i: int, changes: Changes):

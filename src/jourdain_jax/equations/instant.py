@@ -1,5 +1,5 @@
-"""One instant of a scene: all velocities and constraints, with derivatives in the speeds and along the
-motion, computed together.
+"""Velocities and constraints of a scene at one instant, with their derivatives with respect to the speeds and
+along the motion.
 
     v, omega, phi              at (t, q, u)
     beta, gamma, A             their derivatives in u; for rows affine in u they do not depend on u

@@ -89,8 +89,8 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
-    """Return the shapes of the values of `look(scene, motion)`, by a trace only: with numbers, JAX would
-    compile each operation.
+    """Return the shapes of the values of `look(scene, motion)` by tracing: an evaluation would compile each
+    operation of JAX.
     """
     numbers = [
         jax.ShapeDtypeStruct(shape, real_type())

@@ -35,7 +35,7 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
 
     M = jax.jacfwd(momentum, argnums=2)(t, q, u)
     _, momentum_rate = jax.jvp(lambda t, q: momentum(t, q, u), (t, q), (jnp.ones_like(t), u))
-    # h = d/dt (dT/dqdot) at qddot = 0, less dT/dq
+    # h = d/dt (dT/dqdot) at qddot = 0, minus dT/dq
     h = momentum_rate - jax.grad(kinetic_energy, argnums=2)(scene, t, q, u)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
 

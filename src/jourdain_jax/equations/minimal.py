@@ -5,8 +5,8 @@ in the speeds.
     udot = C ydot + c'                 from their rates
     C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy               (41)
 
-A, C and the partial velocities do not depend on u. They are computed once, at `u = (y, 0)`, and serve both
-levels. A has only the rows that were requested. Without redundant rows A_z is square, and its determinant
+A, C and the partial velocities do not depend on u. They are computed once, at `u = (y, 0)`, for speeds and
+accelerations. A has only the requested rows. Without redundant rows A_z is square, and its determinant
 changes sign where it is singular. Source: Wang and Pao (2003), sections III and IV.
 """
 
@@ -26,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class MinimalKinematics(eqx.Module):
-    """All speeds from the privileged ones, with intermediate results."""
+    """All speeds, from the privileged ones, and the intermediate results."""
 
     u: Speeds
     partial: VelocityLevel  # beta, gamma, A
@@ -40,7 +40,7 @@ class MinimalKinematics(eqx.Module):
 def minimal_kinematics(
     scene: Scene, independent: tuple[int, ...], rows: tuple[int, ...], t, q, y, inputs=None
 ) -> MinimalKinematics:
-    """Return `u = C y + c`, from the constraint `rows` with these indices."""
+    """Return `u = C y + c`, from the constraint rows with the indices `rows`."""
     at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
     partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
     weights = inertias_of(motion)

@@ -13,13 +13,12 @@
     slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
     creeps      L_n             e.w_t                        2 s - e.w_t
 
+A phase ends when one of the values in its line falls through zero; the head of the column names the event.
 The event `speed` also ends the motion of a disc or wheel that falls flat.
 
-Each value is the event that ends the phase when it falls through zero. The direction of slip e is part of the
-state with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e turned by a right angle (`slip_turns`). Errors of w_t
-across e therefore do not turn it. The rate has no limit at rest: below the speed s, s replaces e.w_t.
-
-Impacts: `impacts.py`.
+The direction of slip e is part of the state, with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e rotated by a right
+angle (`slip_turns`). Errors of w_t across e therefore do not turn it. The rate has no limit at rest: below
+the speed s, s replaces e.w_t. Impacts: `impacts.py`.
 """
 
 from typing import NamedTuple
@@ -37,8 +36,9 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.scene.contact.friction_contacts import CREEPS, FLAT, FLIES, PAINLEVE, ROLLS, SLIPS
 from jourdain_jax.scene.modes import Event
 
-NEARLY = 1e-4  # least share of the ground's response that friction leaves; Painleve's paradox is at zero
-STOPS = 1e-13  # m/s: slip ends at this speed against its direction, which exceeds the round-off at its start
+# least share of the ground's response that friction must leave; it is zero at Painleve's paradox
+NEARLY = 1e-4
+STOPS = 1e-13  # m/s: slip ends at this speed against its direction; larger than the round-off when it starts
 SAME = 1e-12  # m: a contact that closes within this gap strikes together with another
 TOUCHES = 1e-8  # m: a gap below this counts as closed at the start
 
@@ -151,7 +151,7 @@ class Begun(NamedTuple):
 
 
 def contacts_at_start(at: At) -> Begun:
-    """Return the modes in which contacts start, and the state then."""
+    """Return the modes of the contacts at the start of a motion, and the state in these modes."""
     scene, motion, gap, w = at.scene, at.motion, at.found.rows.gap, at.w
     touches = gap < TOUCHES
     strikes = touches & (w[:, 0] < -LEAST_REBOUND)

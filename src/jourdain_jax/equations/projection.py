@@ -72,7 +72,7 @@ def project_positions(
     """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
-    `typical`: typical lengths of the rows of G, from `closure_lengths`; a row that is round-off beside its
+    `typical`: typical lengths of the rows of G, from `closure_lengths`; a row at the round-off of its typical
     length counts as zero (default: no row does). `by`: the evaluation of the constraints.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
@@ -91,8 +91,8 @@ def project_positions(
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
-    """Return `q / |q|` for every quaternion: the projection without other constraints, and without
-    iteration.
+    """Normalise every quaternion to `q / |q|`. Without other constraints this is the projection, and no
+    iteration is needed.
     """
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
@@ -121,11 +121,11 @@ def project_speeds(
     only `free` speeds change.
 
     - `cutoff`: relative size of singular values below which rows count as dependent (default: `rank_cutoff`).
-    - `typical`: typical lengths of the rows in scaled speeds, from `usual_rows`; a row that is round-off
-      beside its length counts as zero (default: no row does).
-    - `affine`: whether the constraints are affine in the speeds. One step is then exact, and `iterations` has
-      no effect.
-    - `determined`: whether affine constraints determine all `free` speeds. There is then no metric, and
+    - `typical`: typical lengths of the rows in scaled speeds, from `usual_rows`; a row at the round-off of
+      its typical length counts as zero (default: no row does).
+    - `affine`: whether the constraints are affine in the speeds. One step is then exact, and `iterations`
+      has no effect.
+    - `determined`: whether affine constraints determine all `free` speeds. No metric is then used, and
       `typical` is in plain speeds.
     - `by`: the evaluation of constraints and mass matrix.
     """

@@ -1,4 +1,4 @@
-"""Reductions: interchangeable ways from virtual power and constraints to accelerations.
+"""Reductions: interchangeable methods that compute accelerations from virtual power and constraints.
 
     M udot + h = Q + A' lambda,   A udot = -drift
 
@@ -8,9 +8,9 @@
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
 - `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
 
-All agree to round-off where they apply; `applicable` is the test. Without inertia along a free direction,
-accelerations are NaN. `Multipliers` is an exception: its test is too coarse near a loss of rank. All allow
-dependent constraints: the rank is found at every state, and the multipliers have minimum norm.
+All agree to round-off where they apply, which `applicable` tells. If a free direction has no inertia,
+accelerations are NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All allow
+dependent constraints: the rank is determined at every state, and the multipliers have minimum norm.
 """
 
 import abc
@@ -76,8 +76,8 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
-    """Return the last singular value within the usual rank, which vanishes at a loss of rank. For an unknown
-    rank, return the smallest value above the cut-off, or 1 without any.
+    """Return the last singular value within the usual rank, which vanishes at a loss of rank. If the rank is
+    unknown, return the smallest value above the cut-off, or 1 if there is none.
     """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
@@ -110,7 +110,7 @@ class Privileged(Reduction):
     """Appell's equations in privileged velocities: the speeds `independent` are free, and the constraints
     determine the others.
 
-        udot = C yddot + c        zdot = B ydot + b in order, with B = -A_z^-1 A_y
+        udot = C yddot + c        y and z in the scene's order, with zdot = B ydot + b, B = -A_z^-1 A_y
         C' (M (C yddot + c) + h - Q) = 0
 
     Rows that are redundant at every state are allowed: A_z is then tall, with full column rank. The reduction

@@ -30,7 +30,9 @@ from jourdain_jax.scene.user_methods import (
 
 
 class UsualRows(eqx.Module):
-    """Typical constraint rows of a scene, the reference for rows at one state."""
+    """Typical lengths of a scene's constraint rows, and their rank: the reference for the rows
+    at one state.
+    """
 
     lengths: Float[Array | np.ndarray, "rows"]  # of `A` in scaled speeds
     rank: Int[Array | np.ndarray, ""]
@@ -43,7 +45,7 @@ class ConstraintRows(eqx.Module):
     A: Float[Array, "rows speeds"]
     drift: Float[Array, "rows"]
     names: tuple[str, ...] = eqx.field(static=True)
-    usual: UsualRows | None = None  # None: each row is judged by its length at this state
+    usual: UsualRows | None = None  # None: each row is scaled by its length at this state
 
     def judged_by(self, usual: UsualRows | None) -> "ConstraintRows":
         """Return these rows with the reference `usual` (`structure.usual_rows`)."""
@@ -118,7 +120,9 @@ def _coordinate(scene: Scene, name: str) -> str:
 
 
 def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
-    """Return one name per scalar row: the name of its constraint, with an index if this has several rows."""
+    """Return one name per scalar row: the name of its constraint, with an index if the constraint has
+    several rows.
+    """
     names: list[str] = []
     for name, value in rows.items():
         names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]

@@ -3,8 +3,8 @@
     M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w
     c_i = M_ii^(-1/2),   d_s = 1/max(|A_s c|, l_s)        l_s: typical length of row s (`structure_of`)
 
-With l_s, the round-off of a row that vanishes at a configuration is not scaled up. The scales are constant
-under differentiation, because the accelerations do not depend on them.
+A row that vanishes at a configuration has only round-off left; l_s keeps it from being scaled up. The scales
+are constant under differentiation, because the accelerations do not depend on them.
 """
 
 import equinox as eqx
@@ -43,7 +43,7 @@ def row_scale(
     """Return the reciprocal length of each row, or of its `typical` length if that is longer; 1 for a zero
     row without a typical length.
 
-    A row that shrinks along a motion thus counts less and less. It counts as zero once it is round-off beside
+    So a row that shrinks along a motion is also short after scaling. It counts as zero at the round-off of
     its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))

@@ -225,14 +225,15 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
 
         M (impulses, free) = (A', Q - h) + A_p' multipliers,   A_p impulses = 0,   A_p free = -drift_p
 
-    A_p, drift_p: of the constraints that always hold.
+    A_p, drift_p: Jacobian and drift of the constraints that always hold.
     """
     instant = instant_at(scene, motion.t, motion.q.array, motion.u.array, motion.inputs.array)
     equations = equations_of(scene, instant, loads_of(scene, motion))
     held, rows = rows_of(scene, instant), contact_rows(scene, motion)
     count, kept = len(motion.u.array), len(held.phi)
     right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
-    # the last speeds, of the leaves of a tree of bodies, come first: their elimination creates no fill-in
+    # in reverse order: the last speeds belong to the leaves of a tree of bodies, and eliminating them first
+    # creates no fill-in
     moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]
     if kept:
         by_rows = moved[:, len(moved[0]) - kept :]

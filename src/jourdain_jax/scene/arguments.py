@@ -58,7 +58,9 @@ class BuiltFor:
 
 
 def as_scene(scene) -> Scene:
-    """Return `scene`, or the scene of a model. Raises ValueError for any other value, such as a scene class."""
+    """Return `scene`, or the scene of a model. Raises ValueError for any other value, such as a
+    scene class.
+    """
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, BuiltFor):

@@ -105,7 +105,9 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """Return an error message about a misspelt method, attribute or field of a class; empty if there is none."""
+    """Return an error message about a misspelt method, attribute or field of a class; empty if
+    there is none.
+    """
     own = {field.name for field in fields(kind)}
     owners = [owner for owner in kind.__mro__ if owner not in base.__mro__]
     read = {

@@ -37,7 +37,9 @@ _picture: Callable = lambda scene: ""
 
 
 def show_scenes_with(picture: Callable) -> None:
-    """Set the function whose HTML, `picture(scene)`, notebooks show below a scene; a higher layer calls this."""
+    """Set the function whose HTML, `picture(scene)`, notebooks show below a scene; a higher
+    layer calls this.
+    """
     global _picture
     _picture = picture
 

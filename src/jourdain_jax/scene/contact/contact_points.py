@@ -94,8 +94,8 @@ def touch(shape: Shape, ground: Ground) -> Touch:
 
 
 def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
-    """Return the point of the tyre's centre circle nearest to the sphere's surface. Outside the sphere it is
-    the nearest to the sphere's centre, inside the farthest.
+    """Return the point of the tyre's centre circle nearest to the sphere's surface: for a wheel outside the
+    sphere the point nearest to the sphere's centre, for a wheel inside the farthest.
     """
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle

@@ -34,8 +34,8 @@ IMPACTS = ("moreau", "newton", "poisson", "energetic")
 
 
 class Coulomb(eqx.Module):
-    """Coulomb's law of friction: the coefficient `sliding` of a slipping contact, and `static` >= `sliding`
-    of a contact at rest (default: equal).
+    """Coulomb's law of friction: the coefficient `sliding` while a contact slips, and `static` >= `sliding`
+    while it sticks (default: equal).
     """
 
     sliding: Scalar
@@ -56,15 +56,15 @@ class Slipping(TypedDict, total=False):
 
 
 class Contact(eqx.Module):
-    """A point contact of a body with the ground, rolling without slip, at a `point` that you compute.
+    """A point contact of a body that rolls on the ground without slip. Pass its `point`, or let
     `ball_contact` and similar functions compute it.
 
     - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point of contact.
-    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a
-      ground z = 0 at rest).
+    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`, or the
+      resting plane z = 0 without a ground).
     - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`, shown in pictures.
-    - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a geometric
-      constraint.
+    - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a
+      geometric constraint.
     - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
       supports, alone or with their other contacts (default: all bodies of the scene).
     - `distance` (m): the gap (default: the point's height above the plane).
@@ -82,7 +82,7 @@ class Contact(eqx.Module):
     distance: Scalar | None  # m; None: the point's height above the plane
     shape: Shape | None  # of the rolling body, for pictures
     ground: Ground | None  # for pictures; None: the plane
-    friction: Coulomb | None  # None: it rolls, with any friction force
+    friction: Coulomb | None  # None: it never slips
     restitution: Scalar | None
     impact: str = eqx.field(static=True)
 
@@ -134,7 +134,9 @@ class Contact(eqx.Module):
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
     def lean(self) -> Scalar | None:
-        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for others."""
+        """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for
+        other shapes.
+        """
         return 1 - (self.plane.normal @ self.shape.axle) ** 2 if isinstance(self.shape, Wheel) else None
 
 
@@ -151,26 +153,29 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     """Return the rolling contact of a ball with a ground, without slip. The contact point is `c - a n`, with
     the ground's normal n.
 
-    - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
+    - `body`: `pose["name"]`; `radius` a in m.
+
+    Options of all rolling contacts:
+
     - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a geometric
-      constraint.
+    - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a
+      geometric constraint.
     - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
       supports, alone or with their other contacts (default: all bodies of the scene).
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
-      slips (`motion.phase`), and needs `height="row"`. None (default): it rolls, with any friction force.
-    - `restitution`: e of impacts, from 0 (default) to 1. `w_n`, `w_n+` are the normal velocities before and
-      after.
-    - `impact`: the law of impacts. "moreau" (default): w_n+ = -e w_n, and Coulomb's law for the slip
-      afterwards. The other laws integrate over the normal impulse, with friction against the momentary slip,
-      until an end: "newton", w_n+ = -e w_n; "poisson", the impulse of restitution is e times the impulse of
-      compression; "energetic", its work is -e^2 times the work of compression. They need a ball, or slip that
-      keeps its direction, as in a plane; otherwise a result code reports it.
+      slips (`motion.phase`), and needs `height="row"`. None (default): it never slips.
+    - `restitution`: the coefficient e of impacts, from 0 (default) to 1.
+    - `impact`: the law of impacts, for normal velocities w_n before and w_n+ after. "moreau" (default): w_n+
+      = -e w_n, and Coulomb's law for the slip afterwards. The other laws integrate over the normal impulse,
+      with friction against the instantaneous slip, until: "newton", w_n+ = -e w_n; "poisson", the impulse of
+      restitution is e times the impulse of compression; "energetic", its work is -e^2 times the work of
+      compression. They need a ball, or slip of constant direction, as in plane motion; otherwise a result
+      code reports the failure.
 
     It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    height or a length that is not positive. A ball that is too large for its cylinder or sphere raises it
-    when the scene is built.
+    height, for a length that is not positive, and, when the scene is built, for a ball that is too large for
+    its cylinder or sphere.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
@@ -201,14 +206,14 @@ def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unp
     """Return the rolling contact of the edge of a thin disc with a ground, without slip.
 
     The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|`, with the centre c, the
-    ground's normal n and the disc's axis k. It does not exist for a disc that lies flat. On a plane or a
-    sphere it has a closed form.
+    ground's normal n and the disc's axis k. A disc that lies flat has no such point. On a plane or a sphere
+    the point has a closed form.
 
     - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in
       `ball_contact`.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis
-    or height.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
+    axis or height.
     """
     return rolling(
         body,
@@ -225,14 +230,14 @@ def wheel_contact(
 
     The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`,
     with the centre c, the ground's normal n and the axle k. R is the wheel's outer radius, R - r the radius
-    of the centre circle of the tyre; r = 0 makes a `disc_contact`. The point does not exist for a wheel that
-    lies flat. On a plane or a sphere it has a closed form.
+    of the centre circle of the tyre; r = 0 makes a `disc_contact`. A wheel that lies flat has no such point.
+    On a plane or a sphere the point has a closed form.
 
     - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or
       "z". `options`: as in `ball_contact`.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown axis
-    or height.
+    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
+    axis or height.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
     return rolling(

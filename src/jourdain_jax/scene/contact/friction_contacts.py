@@ -1,8 +1,8 @@
 """Declarations that friction adds to a scene: a mode, three events and a direction of slip per contact.
 
-Which contacts have friction depends only on the structure of the scene, and is found once for each structure.
-Velocity constraints that hold until their force exceeds a limit count as contacts; "rolls" is then called
-"holds". For a contact `rim` the scene gets
+Which contacts have friction depends only on the structure of the scene, and is determined once for each
+structure. Velocity constraints that hold until their force exceeds a limit count as contacts; "rolls" is then
+called "holds". For a contact `rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
@@ -29,10 +29,10 @@ from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Labels
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
-# values of a mode for reasons why a motion cannot continue
+# values of a mode that tell why a motion cannot continue
 GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
-MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # it never flies
+MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # a constraint never flies
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
 
 
@@ -56,7 +56,7 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """Class attribute with the class's declarations, and for a scene with friction the extended ones."""
+    """A class attribute with the class's own declarations, extended for a scene with friction."""
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated
@@ -84,7 +84,7 @@ def has_friction(kind: type) -> bool:
 
 def _words(code: CodeType) -> set[str]:
     found = set(names_in(code))
-    for constant in code.co_consts:  # names of arguments are among the constants
+    for constant in code.co_consts:  # names of keyword arguments are among the constants
         if isinstance(constant, CodeType):
             found |= _words(constant)
         else:

@@ -4,9 +4,9 @@ rest or in rigid motion.
     n = grad f/|grad f|     unit normal out of the ground, on the side of the bodies, where f > 0
     n x p = t1, t2          two unit tangents: the directions of the no-slip constraints
 
-A moving ground states its motion twice: by its shape as a function of time, and by `velocity` and
-`angular_velocity`. These also include motion within the ground, as of a belt or a turntable. Along the normal
-both must agree, which is checked when a scene is probed.
+The motion of a ground must be given twice: by its shape as a function of time, and by `velocity` and
+`angular_velocity`. These also include motion within the ground, as of a belt or a turntable. Their normal
+part must agree with the motion of the shape; this is checked when the scene is probed.
 """
 
 from abc import abstractmethod
@@ -61,7 +61,7 @@ class _Ground(eqx.Module):
     def _moves(
         self, what: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)
     ) -> None:
-        """Store the motion, checked."""
+        """Check and store the motion."""
         self.origin = checked_real(origin, f"origin of {what}", (3,))
         self.velocity = checked_real(velocity, f"velocity of {what}", (3,))
         self.angular_velocity = checked_real(angular_velocity, f"angular velocity of {what}", (3,))
@@ -83,15 +83,16 @@ class Plane(_Ground):
     - `velocity` (m/s) at the origin and `angular_velocity` (rad/s): the velocity of the plane's point at p is
       `velocity + angular_velocity x (p - origin)`. All vectors are in the inertial frame.
     - `along`: a vector that is not normal to the plane. The no-slip constraints act along its projection onto
-      the plane, and across. By default they act along the rotated x and y axes; with `normal`, after the
-      shortest rotation of z to n, or of -z if n points down.
+      the plane, and across it. By default they act along the x and y axes, rotated by `tilt`, or by the
+      shortest rotation of z to the given normal n (of -z if n points down).
 
-    A moving plane states its motion twice: by `origin` and `tilt` or `normal` as functions of time, and by
-    `velocity` and `angular_velocity`. These also include motion within the plane, as of a belt or a
-    turntable. Along the normal both must agree, which is checked when a scene is probed.
+    The motion of a plane must be given twice: by `origin` and `tilt` or `normal` as functions of time,
+    and by `velocity` and `angular_velocity`. These also include motion within the plane, as of a belt or
+    a turntable. Their normal part must agree with the motion of the shape; this is checked when the
+    scene is probed.
 
-    Raises ValueError for an `along` normal to the plane, and for both `tilt` and `normal`. A normal that is
-    not a unit vector raises it when the scene is built.
+    Raises ValueError for an `along` normal to the plane, for both `tilt` and `normal`, and, when the scene is
+    built, for a normal that is not a unit vector.
     """
 
     normal: Vector3  # unit vector, out of the ground
@@ -163,7 +164,7 @@ class _Round(_Ground):
         """Return unit vectors along the no-slip constraints."""
 
     def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
-        """Store radius, side and motion, checked."""
+        """Check and store radius, side and motion."""
         if side not in ("inside", "outside"):
             raise ValueError(
                 f"side `{side}` is unknown; expected `inside` or `outside`, the side of the bodies"
@@ -173,7 +174,7 @@ class _Round(_Ground):
 
     def value(self, point: Vector) -> Scalar:
         """Return f = (d^2 - r^2)/(2 r) (m) at a `point` (m, inertial frame) with the distance d from the axis
-        or centre, and the radius r; -f from inside.
+        or centre, and the radius r; -f if the bodies are inside.
         """
         arm = self.arm_to(point)
         outward = (arm @ arm - self.radius**2) / (2 * self.radius)
@@ -188,15 +189,15 @@ class _Round(_Ground):
 
 
 class Cylinder(_Round):
-    """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector
-    `axis`.
+    """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit
+    vector `axis`.
 
     `side`: "inside" or "outside", where the bodies are. `velocity` (m/s): of its material point at the
     origin; `angular_velocity` (rad/s): `rate * axis` for a turning drum. All vectors are in the inertial
     frame. The no-slip constraints act along the axis and around it.
 
-    Raises ValueError for a radius that is not positive or an unknown side. An axis that is not a unit vector
-    raises it when the scene is built.
+    Raises ValueError for a radius that is not positive, for an unknown side, and, when the scene is built,
+    for an axis that is not a unit vector.
     """
 
     axis: Vector3  # unit vector
@@ -297,9 +298,7 @@ class HeightMap(_Ground):
         return z - self.height_at(x, y)
 
     def plane_at(self, point: Vector) -> Plane:
-        """Return the tangent plane of the surface above or below a `point` (m, inertial frame); its z is not
-        used.
-        """
+        """Return the tangent plane at the surface point above or below a `point` (m, inertial frame)."""
         x, y, _ = as_real(point)
         o, i = jnp.zeros_like(x), jnp.ones_like(x)
         height, along_x = jax.jvp(self.height_at, (x, y), (i, o))
@@ -340,7 +339,9 @@ def tangents_of(n: Vector3) -> Tangents:
 
 
 def _turned(tilt) -> Matrix3:
-    """Return the axes x, y and z, turned about y, as columns."""
+    """Return the rotation matrix of a tilt, an angle (rad) about y or the matrix itself; its columns are the
+    rotated axes.
+    """
     advice = "give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)"
     tilt = checked_real(tilt, "tilt of a plane", advice=advice)
     return tilt if tilt.shape == (3, 3) else rot_y(checked_real(tilt, "tilt of a plane", (), advice=advice))

@@ -3,8 +3,8 @@ slip sideways.
 
     w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        w: slip,  L: constraint force, N or N m
 
-Each counts as a contact with friction, with a normal force of one newton and the forces F as coefficients of
-friction. It then has the modes, events and derivatives of contacts (`equations/phases.py`).
+Each is treated as a contact with friction, whose normal force is one newton and whose coefficients of
+friction are the forces F. It then has the modes, events and derivatives of contacts (`equations/phases.py`).
 """
 
 from typing import Any
@@ -69,7 +69,9 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
 
 
 def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
-    """Return the constraints with a limit of force, among results of `velocity_constraints` and `loads`."""
+    """Return the constraints with a force limit, by name, among results of `velocity_constraints`
+    and `loads`.
+    """
     found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
     for load in (loads,) if isinstance(loads, Load) else loads:
         found |= load.rows if isinstance(load, JointFriction) else {}
