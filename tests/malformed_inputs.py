@@ -256,7 +256,7 @@ NAMES: dict[str, Case] = {
     "jj.coordinates('x y', 'x')": "coordinate name `x` is used twice; every coordinate needs its own name",
     "jj.coordinates('1x')": "coordinate name `1x` is not an identifier; use letters, digits and underscores",
     "jj.coordinates('for')": "coordinate name `for` is a keyword of Python, so `q.for` cannot be written",
-    "jj.coordinates('array')": "coordinate name `array` is reserved: `q.array` has a meaning",
+    "jj.coordinates('array')": "coordinate name `array` is reserved: `q.array` already has a meaning",
     "jj.coordinates(jj.quaternion('a b'))": "coordinate name `a b_w` is not an identifier",
     "jj.quaternion(3)": (
         "the name of a quaternion is an int, expected a text, such as jj.quaternion('attitude')"
@@ -492,7 +492,7 @@ STATES: dict[str, Case] = {
         "`inputs` of `Bead` has shape (2,), expected (1,); one number for each of push"
     ),
     "jj.accelerations(b, 0.0, two, two, {'push': lambda t: t})": (
-        "input `push` of `Bead` is a function, expected real numbers; a function of time"
+        "input `push` of `Bead` is a function, expected real numbers; give its value at this instant"
     ),
     "jj.accelerations(b, 0.0, two, two, reduction='rq')": "unknown reduction `rq`; did you mean `qr`?",
     "jj.accelerations(b, 0.0, two, two, reduction=jj.equations.NullSpaceQR)": (

@@ -319,7 +319,7 @@ class OnACusp(BallInBowl):
         (
             TooLarge(),
             (
-                "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state;"
+                "contact `bowl` of `TooLarge` has no point where body and ground touch at any probed state;"
                 " make a ball smaller"
             ),
         ),

@@ -326,11 +326,11 @@ WRONG = {  # the code's text in a lane, the text of the error alone
     ),
     "ball=0.6": (
         "no positive length: ground radius minus ball radius of contact `top`",
-        "`top` .* finds no point where body and ground touch",
+        "`top` .* has no point where body and ground touch",
     ),
     "pipe=-0.5": (
         "no positive length: the radius of the ground of contact `top`",
-        "`top` .* finds no point where body and ground touch",
+        "`top` .* has no point where body and ground touch",
     ),
     "slope=0.1": ("a body off its ground: contact `rim`", "at a probed state its body is"),
     "tilting=0.3": (

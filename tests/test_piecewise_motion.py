@@ -155,7 +155,7 @@ class Road(jj.Scene):
 
 def test_a_road_by_linear_interpolation_is_refused():
     with pytest.raises(
-        ValueError, match=r"the pose of body `mass` of `Road` is not smooth.*at several places"
+        ValueError, match=r"the pose of body `mass` of `Road` is not smooth.*at several configurations"
     ):
         jj.simulate(Road(), {"x_rate": 1.0}, t1=1.0)
 

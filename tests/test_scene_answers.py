@@ -105,8 +105,8 @@ def test_inputs_are_given_by_name_or_as_a_vector():
     with pytest.raises(
         ValueError,
         match=(
-            "input `turn` of `TrailerChain` is a function, expected real numbers; a function of time is for"
-            " `simulate`"
+            "input `turn` of `TrailerChain` is a function, expected real numbers; give its value at this"
+            " instant; only `simulate` takes functions of time"
         ),
     ):
         jj.accelerations(chain, 0.0, q, u, {"turn": lambda t: t})

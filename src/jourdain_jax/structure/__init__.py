@@ -1,7 +1,7 @@
-"""Findings about a scene, made once: the traced graph, probed states, rank, independent speeds, time
-dependence.
+"""Facts about a scene, determined once: the traced graph, probed states, rank, independent speeds,
+time dependence.
 
-Every decision about how a scene is computed uses these findings; no higher package decides again. Open
-`structure.py` first; `probes.py` evaluates the graph at states of the domain, `assembly.py` projects them
-onto the constraints, `probe_findings.py` decides which quantities vanish.
+Every decision about how a scene is computed uses these facts; higher packages do not determine them again.
+Open `structure.py` first; `probes.py` evaluates the graph at states of the domain, `assembly.py` projects
+them onto the constraints, `probe_findings.py` decides which quantities vanish.
 """

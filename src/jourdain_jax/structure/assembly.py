@@ -1,11 +1,11 @@
-"""Random states of the domain, and configurations projected onto the geometric constraints within the domain,
-on NumPy, all at once.
+"""Random states of the domain, and projection of many configurations at once onto the geometric constraints,
+within the domain, on NumPy.
 
     q <- q - G+ g(q),   G = dg/dq          Gauss-Newton, which stays near its start
 
-Configurations that do not converge, or converge outside the domain, are tried again by short steps within the
-domain, from their start and then from random places. Overconstrained linkages have constraints that depend on
-each other at all assembled configurations. Their rank shows only at configurations accurate to round-off, so
+A search that does not converge, or ends outside the domain, is repeated by short steps within the domain,
+first from the same start and then from random places. In overconstrained linkages, constraints depend on each
+other at all assembled configurations. Their rank can be seen only at configurations accurate to round-off, so
 the last steps omit directions with small singular values.
 """
 
@@ -19,7 +19,7 @@ from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
 
-ENOUGH = 8  # random states inside the domain
+ENOUGH = 8  # this number of random states inside the domain suffices
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Assembled:
     q: np.ndarray  # (states, coordinates)
     position_error: np.ndarray  # largest residual of the rows, (states,); infinite for NaN
     error: np.ndarray  # last correction of q, relative to 1 + |q|, (states,); infinite off the constraints
-    outside: np.ndarray  # distance from the domain in its widths, (states,); zero inside
+    outside: np.ndarray  # distance from the domain relative to its width, (states,); zero inside
 
     @property
     def on_rows(self) -> np.ndarray:
@@ -49,11 +49,11 @@ def assemble(
     """Return configurations near q on the constraints, between `low` and `high` if possible.
 
     `look(q[k], k)`: residuals of the constraints, and the entries of their Jacobian with this `pattern`, at
-    the states with indices k. `generic`: which states are random. These are tried again from random places,
-    up to `tries` times, if they end outside the domain.
+    the states with indices k. `generic`: which states are random. If a random state ends outside the domain,
+    its search is repeated from random places, up to `tries` times.
     """
     width, every = np.where(high > low, high - low, 1.0), np.arange(len(q))
-    # off the constraints: at assembled configurations a row may have zero length
+    # lengths off the constraints: at assembled configurations a row may have zero length
     typical = typical_lengths(pattern.lengths(look(q, every)[1])[generic])
 
     def newton(q: np.ndarray, which: np.ndarray, **limits) -> tuple[np.ndarray, np.ndarray]:
@@ -111,8 +111,8 @@ def typical_row_lengths(
 ) -> Float[np.ndarray, "rows"]:
     """Return the typical length of each row, as `usual_lengths_of`.
 
-    `elsewhere`: the rows at states off the geometric constraints. A row that is only round-off beside its
-    length there gets that length, and so counts as zero.
+    `elsewhere`: the rows at states off the geometric constraints. A row at the round-off of its length there
+    gets that length, and so counts as zero.
     """
     length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
     return np.where(length > np.sqrt(eps_of(A)) * beyond, length, beyond)

@@ -8,10 +8,10 @@
     I_3 <= I_1 + I_2
     x' M x > 0 for motions x with A x = 0
 
-The table `CHECKS` has these checks as functions of numbers at some states. It is evaluated when a scene is
-probed, and a fault raises its text. Checks with a `label` also run in the compiled program of each motion,
-where a fault is a result code. They run at the start and, since a start may hide a fault, at random states of
-the domain on the geometric constraints.
+The table `CHECKS` contains these checks as functions of numbers at some states. They run when a scene is
+probed, and a fault raises an error with the message of its check. Checks with a `label` also run in the
+compiled program of each motion, where a fault becomes a result code. There they run at the start and, since
+the start may hide a fault, at random states of the domain on the geometric constraints.
 """
 
 from collections.abc import Callable
@@ -43,8 +43,8 @@ _ROWS_INSTEAD = (
 
 @dataclass(frozen=True)
 class Check:
-    """One check: the kind of numbers, the test (axis of states first), the sentence for one state, and a
-    label if the fault ends a motion.
+    """One check: the kind of numbers, the test (axis of states first), the message for one state, and a label
+    if the fault ends a motion.
     """
 
     of: str
@@ -97,18 +97,21 @@ def _off(square):
 
 
 def _nowhere(x):
-    """Return one flag per state: true for all if no state has finite numbers."""
+    """Return one flag per state. All flags are true if no state has finite numbers; otherwise
+    all are false.
+    """
     bad = ~array_module(x).isfinite(x.reshape(len(x), -1)).all(1)
     return bad & bad.all()
 
 
 def without_inertia(M, A):
-    """Return whether a motion that the rows A permit has no inertia, at each state: whether a pivot of K is
-    zero, to round-off. The null vectors of K are those of M with A x = 0, since both terms are >= 0.
+    """Return for each state whether a motion x that the rows A permit, A x = 0, has no inertia, M x = 0. Such
+    motions are the null vectors of K, since both terms of K are positive semidefinite; they exist if a pivot
+    of K is zero to round-off.
 
         K = M + A' A    in speeds of unit inertia, with rows of unit length
 
-    A pivot that is NaN is not zero.
+    A pivot that is NaN does not count as zero.
     """
     xp, n = array_module((M, A)), M.shape[-1]
     own = xp.stack([M[..., i, i] for i in range(n)], -1)
@@ -126,15 +129,15 @@ def without_inertia(M, A):
 
 
 def checks_inertia(scene: Scene) -> bool:
-    """Return whether compiled programs look for free motions without inertia. The elimination for many speeds
-    would take a minute to compile.
+    """Return whether compiled programs check for free motions without inertia. For many speeds the
+    elimination would take a minute to compile.
     """
     return len(scene.speed_names.entries) <= 16
 
 
 def _exceeds_the_others(x):
     """Return whether the largest moment of a body exceeds the sum of the others by one per cent. For thin
-    wheels both are equal, up to the digits of published values. Rods are exempt.
+    wheels both are equal, apart from the rounding of published values. Rods are exempt.
     """
     least, middle, largest = np.linalg.eigvalsh(x[:, :3]).T
     return (least > TOLERANCE * largest) & (largest > (1 + 1e-2) * (least + middle))
@@ -184,7 +187,7 @@ CHECKS = (
         "touch",
         _nowhere,
         lambda _: (
-            "finds no point where body and ground touch at any probed state; make a ball smaller than its "
+            "has no point where body and ground touch at any probed state; make a ball smaller than its "
             "hollow cylinder or sphere, give a surface a nonzero gradient, and state a `domain` near the "
             "ground"
         ),
@@ -217,8 +220,9 @@ CHECKS = (
         "orientation",
         lambda R: _from_identity(R) > TOLERANCE,
         lambda R: (
-            "has an orientation R that is no rotation: R' R differs from the identity by "
-            f"{_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z or jj.quaternion_to_matrix"
+            "has an orientation R that is not a rotation: R' R differs from the identity by "
+            f"{_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z or "
+            "jj.quaternion_to_matrix"
         ),
         "an orientation that is no rotation",
     ),
@@ -304,7 +308,7 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
     """Return for each fault whether it occurs at this state or at a state from `elsewhere`, with the
-    coordinates `others`. This works under jit and vmap. NaN is no fault.
+    coordinates `others`. This works under jit and vmap. NaN does not count as a fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
@@ -325,7 +329,7 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether any number has a fault. `stacked`: kind -> numbers, with axes of states and of the
+    """Return whether any number fails its check. `stacked`: kind -> numbers, with axes of states and of the
     bodies or contacts that have them.
     """
     found = [
@@ -335,8 +339,8 @@ def any_wrong(stacked: dict[str, Array]) -> Flag:
 
 
 def impossible_bodies(scene: Scene, q) -> Sentences:
-    """Return one sentence for each body whose moments of inertia no distribution of mass has. Rods, with one
-    moment of zero, are exempt.
+    """Return one message for each body with moments of inertia that no distribution of mass has. Rods, with
+    one moment of zero, are exempt.
 
         m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
@@ -351,7 +355,7 @@ def _weights(scene: Scene, q) -> Numbers:
 
 
 def sentences(scene: Scene, numbers: Numbers, group: str) -> Sentences:
-    """Return one sentence for each fault of a group of the table, about the first state with the fault."""
+    """Return one message for each fault of a group of the table, about the first state with the fault."""
     found = []
     for check in (check for check in CHECKS if check.group == group):
         for name, x in numbers.get(check.of, {}).items():

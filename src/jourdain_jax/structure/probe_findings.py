@@ -39,7 +39,7 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         found = probed_on_graph(scene, t, q, u, u_other, generic)
         if not found.in_calls:
             return found
-        # calls of JAX may change away from the probes, so a few distant states are probed
+        # results of JAX calls may be nonzero only far from the probes, so a few distant states are probed too
         generator, count = np.random.default_rng(1), 16
         far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
         for first, _ in scene.coordinates.quaternions:
@@ -56,7 +56,7 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
-    """Return the quantities that are nonzero at distant states; for constraints, above round-off."""
+    """Return the quantities that are nonzero at distant states; for constraints, beyond round-off."""
     some = np.sqrt(eps_of(found.A))
     seen = {name for name, rates in found.vanishing.items() if moves(rates)} - {"rows at rest"}
     rows = (
@@ -72,7 +72,9 @@ def speed_terms(found: Probed, u: np.ndarray) -> np.ndarray:
 
 
 def at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Return times, speeds, flags of random states, and findings, for random and symmetric states."""
+    """Probe a scene at random and symmetric states. Return times, speeds, flags of random states, and the
+    probed quantities.
+    """
     symmetric = symmetric_configurations(scene)
     t, q = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric])
     u = np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
@@ -81,7 +83,7 @@ def at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def is_singular(M: np.ndarray) -> bool:
-    """Return whether scaled inertias are singular at all states."""
+    """Return whether scaled mass matrices are singular at all states."""
     if not M.size:
         return False
     least = np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0]
@@ -89,7 +91,7 @@ def is_singular(M: np.ndarray) -> bool:
 
 
 def no_inertia(scene: Scene, found: Scaled) -> Sentences:
-    """Return a sentence if a free motion has no inertia at any of the states; it names the speeds."""
+    """Return an error message with the names of the speeds if a free motion lacks inertia at every state."""
     if not (len(found.M) and without_inertia(found.M, found.A).all()):
         return ()
     directions = np.linalg.eigh(np.nan_to_num(found.M + found.A.mT @ found.A, nan=1.0))[1][..., 0]

@@ -40,7 +40,7 @@ SparseRows = list[dict[int, int]]  # by row: variable -> node of the derivative
 
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
-# Quantities of poses and constraints. If calls of JAX compute them, distant states are probed; quantities of
+# Quantities of poses and constraints. If JAX calls compute them, distant states are probed too; quantities of
 # loads that calls compute count as nonzero.
 _MOTION = frozenset(
     (
@@ -90,12 +90,11 @@ class LookedAt:
     velocities: SparseRows  # d (v, omega)/du
     closures: list[int]  # geometric constraints and unit norms
     of_closures: SparseRows  # their derivatives with respect to q
-    # Quantities that may be zero everywhere:   "rows at rest", "motion at rest"      residuals, and
-    # velocities and rates of coordinates, at u = 0   names of `TIMED`                      rates in time at
-    # fixed coordinates, speeds and inputs; for loads                                         and potentials
-    # at fixed motion   "inertia"                             rates of masses and inertias along the motion
-    # "rows of inputs", "potential 0", ...  rates of constraints and of each load's potential along a generic
-    # change of the inputs
+    # Quantities that may be zero everywhere, by name. "rows at rest": residuals at u = 0; "motion at rest":
+    # velocities and coordinate rates at u = 0; names of `TIMED`: rates in time at fixed coordinates, speeds
+    # and inputs, for loads and potentials at fixed motion; "inertia": rates of masses and inertias along the
+    # motion; "rows of inputs", "potential 0", ...: rates of constraints and of each load's potential along a
+    # generic change of the inputs
     vanishing: dict[str, list[int]]
     in_calls: frozenset[str]  # quantities that depend on calls of JAX
     nonanalytic: frozenset[str]  # quantities that depend on an operation that is not analytic
@@ -175,7 +174,7 @@ def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> P
 
 
 def projected(scene: Scene, t, q) -> Assembled:
-    """Return the configurations on the geometric constraints nearest to q, without further tries."""
+    """Return the configurations on the geometric constraints nearest to q, without repeated searches."""
     still, every = np.zeros((len(t), len(scene.speed_names.entries))), np.ones(len(t), bool)
     return _AtStates(looked_at(scene), scene, t, q, still, np.zeros(len(scene.inputs)), every, tries=0).found
 
@@ -226,7 +225,7 @@ class _AtStates:
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
-        """Return the graph at coordinates and speeds of the states with indices `which`."""
+        """Return the graph evaluated at coordinates and speeds of the states with indices `which`."""
         return Probes(self.graph, named_values(self.scene, self.t[which], q, u, self.inputs[which]))
 
     def probed(self, u_other) -> Probed:

@@ -19,7 +19,7 @@ from jourdain_jax.structure.probes import Probed
 
 
 class Scaled(eqx.Module):
-    """The quantities from which ranks and pivots are decided, at every probed state."""
+    """The quantities that determine ranks and pivots, at every probed state."""
 
     A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
     lengths: Float[np.ndarray, "states rows"]  # of the rows before scaling
@@ -43,7 +43,7 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
     if not A.size:
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
-    # smaller singular values are errors of the configuration, not of the rows
+    # smaller singular values come from errors of the configuration
     cutoff = np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None]
     return np.sum(sigma > cutoff * sigma[:, :1], axis=1).tolist()
 
@@ -55,7 +55,8 @@ def contradictions(
     at_rest: Float[np.ndarray, "states rows"],
     ranks: list[int],
 ) -> Labels:
-    """Return a sentence about constraints that no speeds satisfy together at any of the random states.
+    """Return an error message if some constraints have no common solution for the speeds at any of the
+    random states.
 
         A u + phi_0 = 0 has a solution if (1 - U U') phi_0 = 0,   A = U S V'
 
@@ -94,12 +95,12 @@ def redundant_rows(
     """Return rows that may be omitted, later rows first: the others keep the rank at every probed state and
     stay well conditioned.
 
-    An omitted row is a combination of the others with bounded coefficients. Coefficients may be unbounded:
-    the lateral row of one wheel of an axle is a combination of its longitudinal row and the rows of the other
-    wheel, with tangents of the heading. `generic`: which of the states `found` are random; `far`: function
-    that returns rows at distant angles.
+    A row is omitted only if it is a combination of the others with bounded coefficients. An example of
+    unbounded coefficients is the lateral row of one wheel of an axle: it is a combination of its longitudinal
+    row and the rows of the other wheel, with tangents of the heading. `generic`: which of the states `found`
+    are random; `far`: function that returns rows at distant angles.
     """
-    if not ranks:  # no usable state is reported as another fault
+    if not ranks:  # a scene without usable states has another fault
         return ()
     kept, everywhere = list(range(len(names))), None
     for s in reversed(range(len(names))):
@@ -117,7 +118,7 @@ def redundant_rows(
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
     """Return the coefficients of row s as a combination of the rows `rest` at states of this rank, in units
-    of their typical lengths; infinite where row s is no combination.
+    of their typical lengths; infinite where row s is not a combination of them.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)
@@ -202,7 +203,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
 
 
 def pivot_columns(A: np.ndarray, rank: int) -> Indices:
-    """Return the columns that pivoted QR chooses: in turn, the one with the largest remaining length."""
+    """Return the columns that pivoted QR chooses: at each step, the one with the largest remaining length."""
     remaining, chosen = A.copy(), []
     for _ in range(rank):
         lengths = np.linalg.norm(remaining, axis=0)

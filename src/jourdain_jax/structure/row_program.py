@@ -36,8 +36,8 @@ Matrix = dict[tuple[int, int], int]  # (row, column) -> node, of nonzero entries
 
 @dataclass(frozen=True, eq=False)
 class RowProgram:
-    """Nodes of a graph. A program is compared by identity, so it can be a static argument of compiled
-    functions.
+    """The program as nodes of a graph. Programs are compared by identity, so that they can be static
+    arguments of compiled functions.
     """
 
     graph: Graph
@@ -176,7 +176,7 @@ def _entries(rows: list[dict[int, int]], variables: list[int]) -> Matrix:
 
 def _mass_matrix(nodes: LookedAt, u: list[int]) -> Matrix | None:
     """Return the lower triangle of `M = d^2 T/du^2`, or None if it is too large."""
-    # more products of entries of velocities than this: too large to be written out
+    # above this number of products of entries of velocities M is too large to be written out
     if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:
         return None
     graph, (kinetic, _) = nodes.graph, nodes.traced.at.energies.tolist()

@@ -16,7 +16,7 @@ from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.assembly import ENOUGH, Assembled, coordinate_bounds, random_states
 from jourdain_jax.structure.probes import Probed, sampled_on_graph
 
-GUESSES = 8  # of a start, of each kind
+GUESSES = 8  # guesses of a start, of each kind
 NEARLY_INSIDE = 0.05  # in widths of the domain
 NOWHERE_FINITE = (
     "; no constraint is finite anywhere: a contact has no point if a ball is larger than its "
@@ -25,9 +25,7 @@ NOWHERE_FINITE = (
 
 
 class NoStateFoundError(ValueError):
-    """Raised for a domain without a state that satisfies the geometric constraints and has finite
-    constraints.
-    """
+    """Raised if no state of the domain satisfies the geometric constraints and has finite constraints."""
 
 
 @of_known_numbers
@@ -86,8 +84,8 @@ def drawn_states(
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
-    """Return configurations from which to search for a start: near q, then the `states` on the constraints
-    that are nearest in coordinates that are not `free`, then random ones in the domain.
+    """Return configurations from which to search for a start: near q, then those of the `states` on the
+    constraints that are nearest to q in coordinates that are not `free`, then random ones in the domain.
     """
     low, high = coordinate_bounds(scene)
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
@@ -147,7 +145,7 @@ def symmetric_configurations(scene: Scene) -> np.ndarray:
     # long chains get fewer configurations: 12,000 coordinates in all, but at least 24 configurations
     most = max(24, min(200, 12_000 // max(1, len(low))))
     if len(turns) < most:
-        # equal angles first: headings of one axle
+        # pairs of equal angles first, such as the headings of one axle
         pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])
         chosen = [(), *((turn,) for turn in turns), *pairs]
     else:

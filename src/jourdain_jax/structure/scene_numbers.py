@@ -118,8 +118,8 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     - "plane": two velocities (m/s) of the contact's plane along its normal: by rates of `origin` and `tilt`,
       and by the stated `velocity` and `angular_velocity`. Third: the sum of the sizes of all terms.
     - "own plane": the same for a `Contact` with a user-defined point.
-    - "ground": the size of the rates of the ground's numbers if only other bodies move, over the size of
-      the speeds of these; and the size of the ground's stated velocity.
+    - "ground": the rates of the ground's numbers if only other bodies move, relative to the speeds of these
+      bodies; and the size of the ground's stated velocity.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())

@@ -1,5 +1,5 @@
-"""Smoothness of the motion of bodies. Where the velocity of a pose jumps, the second derivative does not show
-it, and the impulse of the jump is lost.
+"""Smoothness of the motion of bodies. If the velocity of a pose jumps, the second derivative does not show
+it, and the impulse of the jump is missing from the motion.
 
     r(t, q), R(t, q), g(t, q)      must be continuously differentiable in time and coordinates
     qdot(t, q, u)                  must be continuous
@@ -25,13 +25,14 @@ from jourdain_jax.structure.probes import looked_at, projected
 from jourdain_jax.structure.trace import named_values, owned
 
 SPEEDS_WOULD_JUMP = (
-    "speeds would have to jump there, by an impulse that no acceleration holds. Let it change gradually, as "
-    "by a `jj.Sampled` input, or end the motion there and start another with the new speeds"
+    "speeds would have to jump there, by an impulse that accelerations do not contain. Let it change "
+    "gradually, for example by a `jj.Sampled` input, or end the motion there and start another with the "
+    "new speeds"
 )
 
 
 def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
-    """Return one sentence for each body, constraint or coordinate that jumps or has a velocity that jumps.
+    """Return one message for each body, constraint or coordinate that jumps or has a velocity that jumps.
     `q`, `u`: some states.
     """
     nodes = looked_at(scene)
@@ -69,10 +70,10 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
                 f"constraint `{rows[node]}` of `{type(scene).__name__}` jumps at t "
                 f"= {sides[1, 0]:.6g} s: {SPEEDS_WOULD_JUMP}",
             )
-    # three kinks along coordinates indicate a look-up table; no motion may reach a single one
+    # three kinks along coordinates indicate a look-up table; a motion might never reach a single one
     for name, count in Counter(smooth[node] for node, _ in met(list(smooth), *_across(scene, q))).items():
         if count >= 3:
-            found.setdefault(name, _said(scene, name, "at several places on its way"))
+            found.setdefault(name, _said(scene, name, "at several configurations"))
     return tuple(found.values())
 
 
@@ -118,8 +119,8 @@ def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _said(scene: Scene, what: str, where: str) -> str:
     return (
-        f"{what} of `{type(scene).__name__}` is not smooth: it jumps, or its velocity does, {where}, as by a "
-        "piecewise linear interpolation, a look-up or a branch. The inertia force of a jump is lost, since "
-        "the second derivative is zero on either side. Give samples as `jj.Spline(ts, values)`, and join "
-        "pieces with equal slopes"
+        f"{what} of `{type(scene).__name__}` is not smooth: it jumps, or its velocity does, {where}, for "
+        "example by a piecewise linear interpolation, a look-up or a branch. The inertia force of a jump "
+        "is lost, since the second derivative is zero on either side. Give samples as `jj.Spline(ts, "
+        "values)`, and join pieces with equal slopes"
     )

@@ -82,10 +82,10 @@ class Structure:
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical, in scaled speeds
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in unscaled speeds
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric constraints
-    coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
-    random: int  # number of random ones
-    closure_slopes: np.ndarray = field(compare=False, repr=False)  # of closures, first states
-    row_slopes: np.ndarray = field(compare=False, repr=False)  # A, same states
+    coordinates: np.ndarray = field(compare=False, repr=False)  # of the same states; random ones first
+    random: int  # number of random states
+    closure_slopes: np.ndarray = field(compare=False, repr=False)  # G at the first random states
+    row_slopes: np.ndarray = field(compare=False, repr=False)  # A at the same states
 
     @property
     def decisions(self) -> tuple:
@@ -137,13 +137,15 @@ class Structure:
 
     @property
     def dependent_rows(self) -> bool:
-        """Return whether the kept rows still depend on each other, each being needed at some state."""
+        """Return whether the kept rows are dependent at generic states; each is needed at some
+        other state.
+        """
         return len(self.kept_rows) > self.rank
 
     @property
     def rows_may_contradict(self) -> bool:
-        """Return whether constraints are redundant and prescribe motion at rest. The omitted constraints may
-        then contradict the others.
+        """Return whether constraints are redundant and not all linear and homogeneous in the speeds. The
+        omitted constraints may then contradict the others.
         """
         return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
 
@@ -165,12 +167,12 @@ def structure_of(scene: Scene) -> Structure:
 
     They are found once per class and parameter values, at random and symmetric states of the domain. Concrete
     numbers replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not
-    move smoothly, or if a free motion has no inertia. It is also raised if `privileged` names unknown or too
-    few speeds and, for known parameters, by impossible numbers of bodies or planes and by contradictory
+    move smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For
+    known parameters it is also raised by impossible numbers of bodies or planes and by contradictory
     constraints.
     """
     structure = structure_whatever_its_faults(scene)
-    # replaced parameters prove nothing about bodies and grounds
+    # findings at replaced parameters prove nothing about bodies and grounds
     of_numbers = structure.odd_grounds or structure.faults if is_judged(scene) else ()
     if wrong := structure.without_inertia or structure.kinks or of_numbers:
         raise ValueError(wrong[0])
@@ -255,7 +257,7 @@ def _probed_structure(scene: Scene) -> Structure:
     scaled = scaled_states(found, typical)
     ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
-    # a negative mass is another fault
+    # other faults, such as a negative mass, come first
     inert = () if faults else no_inertia(scene, at_index(scaled, generic & (np.array(ranks) == rank)))
     # at isolated losses of rank no partition has the generic size
     candidates = scaled.A[[r == rank for r in ranks]]
@@ -352,11 +354,11 @@ class Reference:
     """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
 
     Two references are equal if their scenes lead to the same decisions (`Structure.decisions`), and then
-    share one program. The arguments of a call thus determine its program, not the order of calls. Numbers
+    share one program. The program of a call thus depends on its arguments, not on the order of calls. Numbers
     near the class's defaults replace parameters that are traced already.
 
     `varied`: names of parameters that differ within a batch (None: all). Numbers nearby replace them, so that
-    equal numbers by coincidence do not count.
+    numbers that are equal by coincidence have no effect.
     """
 
     def __init__(self, scene: Scene, varied: Iterable[str] | None = None):
@@ -367,7 +369,7 @@ class Reference:
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
-        """Return a context in which its numbers replace traced parameters."""
+        """Replace traced parameters by the numbers of this scene within this context."""
         with reference_parameters(self.scene, self._varied):
             yield
 

@@ -76,7 +76,7 @@ class VelocityQuantities(eqx.Module):
     slip_turns: Num[Entries, "directions"]  # rates of directions of slip, the last coordinates
     # projected onto the constraints of closed contacts; empty without switching contacts
     held: Num[Entries, "coordinates_and_speeds"]
-    start: Num[Entries, "numbers"]  # `switching.Begun`
+    start: Num[Entries, "numbers"]  # `phases.Begun`
     # for each state of switching contacts: coordinates, speeds, inputs, and the response (`ContactResponse`)
     responses: Num[Entries, "states numbers"]
 
@@ -226,8 +226,8 @@ class TracedScene(Variables):
 
 
 def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
-    """Return the scene as a new graph. Parts without scalar form, or with a user-defined derivative, are
-    calls.
+    """Return the scene as a new graph. Parts without scalar form, or with a user-defined derivative,
+    become calls.
 
     `of_inputs`: indices of the loads whose potential depends on inputs.
     """
@@ -235,7 +235,7 @@ def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
     if isinstance(found, str):
         raise Unsupported(found)
     graph = copy(found.graph)
-    # its lists, to which nodes may be added
+    # copy its lists as well, since nodes may be added to them
     vars(graph).update({name: copy(x) for name, x in vars(graph).items()})
     return replace(found, graph=graph)
 
@@ -252,8 +252,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
 
 @once_per_class
 def _traced(scene: Scene, of_inputs: Indices) -> tuple:
-    """Return the jaxpr with its shapes, and the scene on a graph that must not be changed. In place of the
-    graph return the name of an operation without scalar form.
+    """Return the jaxpr with its shapes, and the scene on a graph that must not be changed. If an operation
+    has no scalar form, return its name in place of the graph.
     """
     closed, shape = _jaxpr(scene, of_inputs)
     try:
