@@ -1,4 +1,6 @@
-"""Code of Python functions: functions in members of classes, and the names that they load."""
+"""Inspection of Python functions: the functions in a member of a class, and the names that a
+function loads.
+"""
 
 import dis
 import sys
@@ -33,7 +35,7 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def attribute(x, name: str):
-    """Return an attribute, or None if reading it raises an error, as of an unset variable."""
+    """Return an attribute, or None if reading it raises an error, as for an unset variable."""
     try:
         return getattr(x, name, None)
     except Exception:
@@ -44,7 +46,7 @@ def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[str], An
     """Return two pairs, for globals and for variables of enclosing functions: the names that a function
     itself reads, and a function from name to value (None if not yet set).
     """
-    # names that the function itself sets do not count, such as a counter of calls
+    # omit names that the function itself sets, such as a counter of calls
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
     own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
     cells = {

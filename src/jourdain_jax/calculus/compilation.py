@@ -93,7 +93,7 @@ def _whole(arrays, treedef, rest):
 
 
 def nan_is_a_mark():
-    """Return a context in which `jax_debug_nans` is off, since NaN marks failures there."""
+    """Return a context in which `jax_debug_nans` is off, for computations that mark failures by NaN."""
     return jax.debug_nans(False)
 
 

@@ -1,4 +1,4 @@
-"""Errors of derivatives that do not exist, with their messages."""
+"""Errors for derivatives and programs that are not available, and their messages."""
 
 SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice, with reverse mode (jax.hessian, grad of grad); only machine code "
@@ -13,7 +13,7 @@ THIRD_ORDER_MESSAGE = (
 class DifferentiationModeError(TypeError):
     """Raised if a motion has no derivative of the requested mode and order; the text names a supported one.
 
-    The error comes where the derivative is taken, evaluated or compiled. Functions that need concrete
+    It may be raised when the derivative is taken, evaluated or compiled. Functions that need concrete
     numbers, such as `fit`, raise it inside `jit`, `vmap` or a derivative.
     """
 

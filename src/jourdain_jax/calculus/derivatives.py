@@ -1,8 +1,9 @@
-"""Functions whose values and derivatives come from separate computations: an equivalent function or explicit
-rules.
+"""Functions whose values and derivatives come from separate computations: an equivalent function or
+explicit rules.
 
-JAX differentiates two functions forward: `f'(x) w` of tangents w and `g f'(x)` of cotangents g. They give
-first and second derivatives in both modes (`linear_maps.py`).
+The derivatives are given as two functions, `f'(x) w` of tangents w and `g f'(x)` of cotangents g, which JAX
+differentiates in forward mode. Together they give first and second derivatives in both modes
+(`linear_maps.py`).
 
 A function and its rule must agree on which results have a batch axis and where, because JAX assumes the
 layout of whichever is batched first.
@@ -101,8 +102,8 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
 
 
 def with_derivatives_of(function: Callable, value, *arguments):
-    """Return `value`, which equals `function(value, *arguments)`, with the derivatives of this function. It
-    must have a batch axis if an argument has one.
+    """Return `value`, which equals `function(value, *arguments)`, with the derivatives of this function.
+    `value` must have a batch axis if an argument has one.
     """
     return differentiated_as(function, lambda value, *_: value)(value, *arguments)
 
@@ -162,7 +163,8 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
             def cotangents(leaves, ends, given):
                 g = jax.tree.unflatten(structure, put([None] * len(ends), places, given))
                 by_rules = rules.pull(varies, of.whole(leaves), jax.tree.unflatten(structure, ends), g)
-                return jax.tree.leaves(eqx.filter(by_rules, varies))  # rules may return more
+                # rules may return cotangents of other arguments too
+                return jax.tree.leaves(eqx.filter(by_rules, varies))
 
             return cotangents
 

@@ -1,6 +1,7 @@
-"""Jumps of functions along a line, by bisection towards the half with the larger difference of values.
+"""Search for jumps of functions along lines, by bisection towards the half with the larger
+difference of values.
 
-The difference vanishes for a continuous function and stays for a jump.
+As the interval shrinks, the difference vanishes for a continuous function and remains for a jump.
 """
 
 from collections.abc import Callable, Iterator

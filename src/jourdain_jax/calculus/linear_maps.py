@@ -1,14 +1,15 @@
 """Linear maps as a primitive of JAX: forward mode evaluates a map, reverse mode transposes it.
 
 One function computes the values of a map, another the values of its transpose, so that neither mode traces
-what only the other needs. First and second derivatives of f(x) are four maps, here of vectors v, w and of
-cotangents g:
+operations that only the other needs. First and second derivatives of f(x) are four maps, here of vectors v, w
+and of cotangents g:
 
     pushes   w -> f'(x) w                          pulls   g -> g f'(x)
     turns    v -> f''(x)(v, w)                     bends   v -> g f''(x)(., v)
 
-Pulls transpose pushes. Because f'' is symmetric, bends along v transpose bends, and they transpose turns
-along w = v. The maps depend on x and on f(x) as separate arguments; a derivative along x accounts for both.
+Pulls are the transposes of pushes. Because f'' is symmetric, the transpose of bends in v is bends, and the
+transpose of turns is bends at v = w, as a map of g. The maps depend on x and on f(x) as separate arguments; a
+derivative along x accounts for both.
 """
 
 import operator
@@ -29,7 +30,7 @@ from jourdain_jax.calculus.markers import lanes_of, with_lanes_first
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """Linear map between arrays that depends on other arrays, `at`."""
+    """A linear map of arrays, which also depends on other arrays, `at`."""
 
     apply: Callable[[Sequence, Sequence], list]  # (at, arrays) -> values
     shapes: Sequence[jax.ShapeDtypeStruct]  # of the values
@@ -185,8 +186,7 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """Derivative of a function in both modes. Only the leaves with given indices move; the others are fixed.
-
+    """Derivative of a function in both modes. Only the leaves with given indices vary; the others are fixed.
     `rates` and `pulled` take these indices and return a function:
 
         rates     (leaves, *tangents of the moving leaves) -> tangents of the real results

@@ -13,9 +13,9 @@ For a computation y(x) between `entered` and `left`, with some samples that fail
 from failed values that are not used.
 
 An extra number, which is zero, goes from `entered` to `left`; its derivative counts the nonzero derivatives.
-The rules are linear maps, and so are their derivatives. In reverse mode of these, cotangents reach x through
-the point of the first derivative, without passing `left`. The earlier count is therefore a part of that
-point.
+The rules are linear maps, and so are their derivatives. In reverse mode of such a derivative, cotangents
+reach x through the point at which the first derivative was taken, without passing `left`. That point
+therefore includes the count of the first derivative.
 """
 
 from collections.abc import Callable, Sequence
@@ -191,7 +191,7 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
 
 @jax.custom_jvp
 def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
-    """Return these arrays, and the zero for `left` that counts derivatives."""
+    """Return these arrays, and for `left` a zero whose derivative counts nonzero derivatives."""
     *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
     return each, asked
 
@@ -311,7 +311,7 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
 
     def pushed(primals, tangents, *, lanes):
         taken_at = list(primals[:at])
-        if function in (_masked, _lost):  # the last of these is the earlier count
+        if function in (_masked, _lost):  # the last of these is the count of the first derivative
             taken_at[-1] = jnp.abs(taken_at[-1]) + jnp.abs(primals[-2])
         along = map(ad.instantiate_zeros, tangents[at:])
         return p.bind(*primals, lanes=lanes), p.bind(*taken_at, *along, lanes=lanes)

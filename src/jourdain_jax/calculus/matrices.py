@@ -68,8 +68,8 @@ def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -
 
 
 def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Return a null-space basis from the full singular value decomposition; columns of the row space are
-    zero.
+    """Return a null-space basis from the full singular value decomposition; columns outside the null
+    space are zero.
     """
     return _null_space(A, _svd_basis, None)
 
@@ -77,8 +77,8 @@ def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns col
 def null_space_qr(
     A: Float[Array, "rows columns"], cutoff: float | None = None
 ) -> Float[Array, "columns columns"]:
-    """Return a null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space
-    are zero.
+    """Return a null-space basis from the column-pivoted QR decomposition of `A'`; columns outside the null
+    space are zero.
 
     Pivots below `cutoff` times the largest count as zero (default: `rank_cutoff`).
     """

@@ -241,7 +241,7 @@ def described(value) -> str:
 
 def is_traced(*trees) -> bool:
     """Return whether any leaf is traced."""
-    # other values are leaves; this check takes a tenth of the time
+    # plain numbers and NumPy arrays are not traced; this check takes a tenth of the time of the next line
     unknown = [tree for tree in trees if not isinstance(tree, float | int | np.ndarray)]
     return bool(unknown) and any(map(is_traced_type, map(type, jax.tree.leaves(unknown))))
 
@@ -272,8 +272,8 @@ def tiny_of(x):
 
 
 def at_index(tree, index):
-    """Return the tree with `x[index]` for each array `x`. In this machine's memory NumPy reads it, for which
-    JAX would compile two programs for each shape.
+    """Return the tree with `x[index]` for each array `x`. NumPy indexes arrays in this machine's memory,
+    since JAX would compile two programs for each shape.
     """
     known = not is_traced((tree, index))
     here = lambda x: known and isinstance(x, jax.Array) and {d.platform for d in x.devices()} == {"cpu"}
@@ -309,7 +309,7 @@ _may_have_unit: Callable[[type], bool] = lru_cache(maxsize=1024)(
     )
 )
 
-# Cached by type, at a tenth of the time of an isinstance check against the classes of JAX.
+# Cached by type: a tenth of the time of an isinstance check against the classes of JAX.
 is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(
     lambda kind: issubclass(kind, jax.core.Tracer)
 )

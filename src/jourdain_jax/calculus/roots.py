@@ -159,8 +159,9 @@ def damped_search(
 def smooth_root(
     look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80
 ) -> Unknowns:
-    """Return the root near a guess, differentiable up to the third order. After a search without derivatives
-    come three steps `x <- x - J+ R(x)` with constant J; each makes one more order of derivatives correct.
+    """Return the root near a guess, differentiable up to the third order. A search without derivatives
+    is followed by three steps `x <- x - J+ R(x)` with constant J; each makes one more order of
+    derivatives correct.
 
     `look`: function from x to residuals R and Jacobian J, without derivatives; `rows`: function from x to R;
     `x`: values of the fixed unknowns (size zero), with their derivatives; `cutoff`: relative cutoff of J+.
@@ -178,14 +179,14 @@ def smooth_root(
 def first_root(
     rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds
 ) -> tuple[Nearest, Count]:
-    """Return the root from the first successful one of the `guesses`, and its index. If none succeeds, return
-    the end with the smallest residuals.
+    """Return the root found from the first successful guess, and the index of this guess. If no search
+    succeeds, return its end with the smallest residuals.
 
     A root has residuals of at most `good`. Other arguments, including the `bounds`, as for `damped_search`.
     """
     count = guesses.shape[0]
-    # limit of Jacobian entries held at once per sample: all guesses of 96 trailers, times 17 samples, took 57
-    # GB
+    # limit of Jacobian entries in memory per sample: all guesses at once of 96 trailers, in 17 samples,
+    # took 57 GB
     block = max(1, min(count, 50_000 // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
     blocks = -(-count // block)
     # the last guess fills the last block
@@ -211,7 +212,7 @@ def first_root(
 
 
 QUIET = 2  # number of steps without change after which the iteration has settled
-ROUND_OFF = 1e3  # a change exceeds this many eps, relative to 1 + |x|
+ROUND_OFF = 1e3  # a change is larger than this many eps, relative to 1 + |x|
 
 
 def fixed_point(
@@ -323,8 +324,8 @@ def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) ->
 
 
 def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return G+ at every state, NaN where G is NaN. Rows are first scaled to unit length; rows below
-    `typical` become shorter than that.
+    """Return G+ at every state, NaN where G is NaN. Rows are first scaled to unit length; rows shorter than
+    `typical` are scaled to less.
     """
     lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
     d = 1 / np.where(lengths > 0, lengths, 1.0)

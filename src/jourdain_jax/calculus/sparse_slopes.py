@@ -1,8 +1,10 @@
-"""Sparse Jacobians G of constraints at many states: each constraint has few coordinates, as in a long chain.
+"""Sparse Jacobians G of constraints at many states: each constraint involves few coordinates, as in
+a long chain.
 
     G x = f,   x shortest:      G G' y = f,   x = G' y
 
-The time of a dense solution grows with the cube of the number of rows, of a sparse solution linearly (chain).
+The time of a dense solution grows with the cube of the number of rows, that of a sparse solution of a
+chain linearly.
 """
 
 import contextlib
