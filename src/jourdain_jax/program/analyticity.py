@@ -1,7 +1,7 @@
 """Analyticity of expressions: an analytic expression that is zero at random states is zero everywhere.
 
-Expressions of +, -, *, /, roots, sines and cosines are analytic; branches and opaque calls are not. A
-function that is flat somewhere also breaks the rule.
+Expressions of +, -, *, /, roots, sines and cosines are analytic; branches and opaque calls are not. Functions
+that are constant to round-off over some range do not obey the rule either.
 """
 
 from collections.abc import Callable, Collection, Iterable

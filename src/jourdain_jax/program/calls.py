@@ -21,7 +21,9 @@ from jourdain_jax.program.graph import Unsupported
 
 
 class Call:
-    """Closed jaxpr that is kept as a call, and the reasons. Calls of the same operations are equal."""
+    """A closed jaxpr that is kept as a call, and the reasons for it. Calls with the same
+    operations are equal.
+    """
 
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
@@ -49,8 +51,8 @@ class Call:
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Return a call whose results are the derivatives of each result, with an axis of the moving entries
-        of the operands first. Raises `Unsupported` if JAX has no forward derivative.
+        """Return a call that computes the derivatives of each result. Their first axis runs over the entries
+        of the operands that move. Raises `Unsupported` if JAX has no forward derivative.
         """
         function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
         places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]

@@ -1,4 +1,4 @@
-"""Arrays of nodes reduced over axes (sums, products, extremes), and matrix products."""
+"""Reductions of arrays of nodes over axes (sums, products, extremes), and matrix products."""
 
 from collections.abc import Sequence
 

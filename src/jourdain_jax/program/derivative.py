@@ -1,11 +1,13 @@
-"""Derivatives on the graph: directional derivatives, cotangents, Jacobians, and JAX programs with such rules.
+"""Derivatives on the graph: directional derivatives, cotangents, Jacobians, and JAX programs that use them as
+derivative rules.
 
 A JAX program with outputs o_i of variables x_j gets its own derivative rule from the Jacobian on the graph:
 
     d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and each other
 
-The entries are computed once, with the values, for any number of tangents, and reverse mode stores nothing
-else. A program with a large Jacobian, or with an operation without a rule on the graph, is left to JAX.
+The entries J_ij are computed once, with the values, for any number of tangents, and reverse mode stores only
+them. JAX differentiates the other programs: those with a large Jacobian, or with an operation without a rule
+on the graph.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -168,9 +170,9 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
 def differentiable(
     graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()
 ) -> Callable[..., tuple]:
-    """Return a JAX function of the values of `variables`, on which all outputs must depend. It returns the
-    `outputs` and then the nodes `monitored`, which get no derivatives, in the shape and precision of variable
-    `like`.
+    """Return a JAX function of the values of `variables`, which must determine all outputs. It returns the
+    `outputs` and then the nodes `monitored`, which get no derivatives, in the shape and precision of
+    variable `like`.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
@@ -231,7 +233,7 @@ def _entries(
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None
-    # above 100_000 operations times variables, deriving takes longer than it saves
+    # above 100_000 operations times variables, building the Jacobian takes longer than it saves
     if operations * len(variables) > 100_000:
         return None
     try:

@@ -21,7 +21,7 @@ from jourdain_jax.program.fused_loop import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
 
 # longest chain of operations in a program without pieces; measured: pieces make chains of links and trailers
-# faster from 100 to 250 on, but cost the bicycle (102) a quarter
+# faster from a length of 100 to 250 on, but the bicycle (102) a quarter slower
 DEEP = 120
 PIECE = 128  # operations
 

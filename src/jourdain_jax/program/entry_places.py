@@ -1,4 +1,4 @@
-"""Places of the entries that a gather reads and a scatter writes, and both on NumPy arrays."""
+"""Flat places of the entries that a gather reads or a scatter writes, and both operations on NumPy arrays."""
 
 import math
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ def gathered(params, x: np.ndarray, indices: np.ndarray) -> np.ndarray | None:
 
 
 def targets(params, x, indices: np.ndarray, update) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat places of x that a scatter changes, and the entries that it takes there."""
+    """Return the flat places of x that a scatter changes, and the entries of `update` for these places."""
     n, count = params["dimension_numbers"], indices.ndim - 1
     moved = np.moveaxis(update, n.update_window_dims, range(count, update.ndim))
     window = iter(moved.shape[count:])
@@ -53,7 +53,9 @@ def targets(params, x, indices: np.ndarray, update) -> tuple[np.ndarray, np.ndar
 
 
 def scattered(params, x, indices: np.ndarray, update) -> np.ndarray | None:
-    """Return x with the entries of `update` at its places; None if a function changes entries of x there."""
+    """Return x with the entries of `update` at its places; None if the scatter changes entries
+    by a function.
+    """
     if params["update_jaxpr"] is not None:
         return None
     flat, (where, entries) = x.flatten(), targets(params, x, indices, update)

@@ -47,8 +47,8 @@ class Probes:
         return int(signs.pop()) if len(signs) == 1 else 0
 
     def in_the_middle(self, node: int) -> int:
-        """Return the node as a function of parameters only: other inputs have their values at the probe with
-        the median magnitude. If no probe has a nonzero value, return 1.
+        """Return the node as a function of parameters only: other inputs get their values at the probe where
+        the node has its median magnitude. If no probe has a nonzero value, return 1.
         """
         graph, size = self.graph, np.abs(self([node])[0])
         known = np.flatnonzero(np.isfinite(size) & (size > 0))

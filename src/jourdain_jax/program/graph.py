@@ -1,8 +1,8 @@
 """Hash-consed graph of scalar expressions: equal expressions are one node.
 
-Simplified are constants, 0 + x, 0 x, 1 x, x - x, squares of square roots, sin(-x) and cos(-x). Signs move
-outwards, so that a - (-b) = a + b. Arguments of sums and products are ordered, so that a b and b a are one
-node.
+The graph simplifies constants, 0 + x, 0 x, 1 x, x - x, squares of square roots, sin(-x) and cos(-x). Signs
+move outwards, so that a - (-b) = a + b. Arguments of sums and products are ordered, so that a b and b a
+are one node.
 """
 
 import math
@@ -240,7 +240,7 @@ class Graph:
         if all(self.op[a] == "const" for a in args):
             with np.errstate(all="ignore"):
                 value = TABLE[op].value(*(self.value[a] for a in args))
-            if np.isfinite(value):  # otherwise left to the program
+            if np.isfinite(value):  # other values are left to the program
                 return self.const(value)
         a = args[0]
         if op == "sin" and self.op[a] == "neg":
@@ -353,7 +353,7 @@ class Graph:
         return sorted(seen)  # arguments have smaller indices than the nodes that use them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """Return the numbers that depend only on parameters and that varying nodes use."""
+        """Return the nodes that depend only on parameters and that varying nodes use."""
         outputs = list(outputs)
         found = {
             a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]

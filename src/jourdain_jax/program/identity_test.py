@@ -3,13 +3,14 @@
 Sums, products, quotients, roots, sines and cosines of random generic numbers agree only if they agree
 everywhere (Schwartz, 1980; Zippel, 1979). The numbers of a scene are not generic: a parameter may be tiny, or
 time may end before a switch. Functions that branch or saturate may also behave differently between probes.
-Inputs are therefore drawn anew, of order one and larger, and any other function is replaced by a generic one
-that is neither flat nor kinked. An identity that then holds does so for any such functions.
+Inputs are therefore replaced by random numbers, of order one and larger, and any other function by a generic
+one that is neither flat nor kinked. An identity that holds with these replacements holds for all functions.
 
 No comparison uses a fixed tolerance. Every value carries a round-off bound (`calculus/round_off.py`), and two
-values are equal if they differ by no more. Constants in the code of a scene may be far from one (1e-24, 1e16)
-and would dominate or vanish. They are written as c = m R^j with R = 2^40 and |m| between 2^-20 and 2^20, and
-R is drawn anew at every probe: an identity that holds for any R holds for this one.
+values count as equal if their difference is within their bounds. Constants in the code of a scene may be far
+from one (1e-24, 1e16) and would dominate or vanish. They are written as c = m R^j with R = 2^40 and |m|
+between 2^-20 and 2^20, and R is replaced by a random number at every probe: an identity that holds for any R
+holds for 2^40.
 """
 
 import math
@@ -177,7 +178,7 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
     scale = np.where(np.arange(count) % 2, 10.0, 1.0)
 
     def drawn(name: str, value: np.ndarray) -> np.ndarray:
-        # a mode is always an integer
+        # a mode is an integer and keeps its values
         if name in unchanged or (name.startswith("i") and np.ptp(value) > 0 and not np.any(value % 1.0)):
             return value
         return (
@@ -223,7 +224,7 @@ def on_rows(
 
 
 def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
-    """Return a constant with R drawn anew, and its round-off bound."""
+    """Return a constant with a random R in place of 2^40, and its round-off bound."""
     j = round(math.frexp(value)[1] / DIGITS) if math.isfinite(value) else 0
     moderate = math.ldexp(value, -DIGITS * j) * radix**j
     return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])

@@ -155,7 +155,9 @@ def own_rule(name: str, params) -> str:
 
 
 def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.ndarray]:
-    """Return nodes moved by a primitive like numbers; numbers among them become constants."""
+    """Return the nodes that a primitive moves as if they were numbers; numbers among its operands
+    become constants.
+    """
     entries = _MOVES[name](len(inputs))
     if any(isinstance(x, Nodes) for i, x in enumerate(inputs) if i not in entries):
         raise Unsupported("an index that depends on the state")
@@ -204,7 +206,7 @@ _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
     **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),
 }
-# `program/numpy_backend.py` moves the node indices of all others, as if they were numbers.
+# For all other primitives, `program/numpy_backend.py` moves the node indices as if they were numbers.
 _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,

@@ -73,7 +73,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Opaque:
-    """Value that is not an array of scalars: the node of an array."""
+    """A value without scalar form: the node of an array."""
 
     node: int
 

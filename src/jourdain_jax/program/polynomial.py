@@ -135,7 +135,9 @@ class NormalForms:
         return p
 
     def _rooted(self, p: Polynomial) -> tuple[NodeList, Polynomial] | None:
-        """Return the atoms that leave the root, and the remaining radicand; None if there are none."""
+        """Return the atoms that can be taken out of the root of p, and the remaining radicand; None if
+        there are none.
+        """
         if len(p) == 1:
             ((monomial, c),) = p.items()
             counts = Counter(monomial)
@@ -259,7 +261,7 @@ class NormalForms:
             )
         return self._reciprocals[atom]
 
-    # and back
+    # reconstruction
 
     def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
         """Return a node with few operations for the polynomial p, divided by the node `divisor`, a function
