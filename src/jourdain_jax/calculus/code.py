@@ -22,7 +22,9 @@ def is_installed(name: str | None) -> bool:
 
 
 def functions_in(member) -> list[FunctionType]:
-    """Return the Python functions in a member of a class, without wrappers of other modules."""
+    """Return the Python functions in a member of a class, including wrapped ones. Wrappers defined in other
+    modules are omitted.
+    """
     found, member = [], member.fget if isinstance(member, property) else member
     while member is not None and not isinstance(member, type):
         if isinstance(member, FunctionType) and (
@@ -43,8 +45,8 @@ def attribute(x, name: str):
 
 
 def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[str], Any]], ...]:
-    """Return two pairs, for globals and for variables of enclosing functions: the names that a function
-    itself reads, and a function from name to value (None if not yet set).
+    """Return two pairs (names, lookup), for globals and for variables of enclosing functions. `names`: those
+    that the function itself reads; `lookup(name)`: the value, or None if it is not yet set.
     """
     # omit names that the function itself sets, such as a counter of calls
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))
@@ -59,8 +61,8 @@ def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[str], An
 
 @lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
-    """Return the names that code uses, including attributes and inner functions. `operations`: only names of
-    these instructions.
+    """Return the names that code uses, including attributes and inner functions. `operations`: count only the
+    names in instructions of these kinds.
     """
     own = frozenset(
         code.co_names

@@ -1,4 +1,4 @@
-"""Functions compiled or run in JAX's default modes.
+"""Compilation with little overhead per call, and JAX's default modes.
 
 Compiled functions have a tenth of the overhead of `equinox.filter_jit`, and cheaper XLA options where
 compiling takes longer than running. Inside the package, types and ranks promote by JAX's defaults even if the

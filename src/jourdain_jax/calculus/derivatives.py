@@ -25,8 +25,8 @@ from jourdain_jax.calculus.markers import lanes_first
 
 
 class Rules(NamedTuple):
-    """Derivative rules of a function, which JAX differentiates forward. Trees of tangents and cotangents have
-    None for zeros. A rule that does not apply raises an error with the reason.
+    """Derivative rules of a function. JAX differentiates the rules in forward mode. Trees of tangents and
+    cotangents have None for zeros. A rule that does not apply raises an error with the reason.
     """
 
     push: Callable  # (arguments, tangents) -> result and its tangents
@@ -109,7 +109,7 @@ def with_derivatives_of(function: Callable, value, *arguments):
 
 
 def pushed_by_jax(run: Callable) -> Callable:
-    """Return the `push` rule of a function that JAX differentiates forward."""
+    """Return the forward rule (`push`) of a function that JAX can differentiate in forward mode."""
 
     def push(arguments: tuple, tangents: tuple):
         moving, fixed = eqx.partition(
@@ -121,8 +121,8 @@ def pushed_by_jax(run: Callable) -> Callable:
 
 
 def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -> Callable:
-    """Return `forward`, differentiated by JAX in forward mode, with the reverse mode of the equivalent
-    `reverse`.
+    """Return `forward` with derivatives by JAX: forward mode differentiates `forward`, reverse mode the
+    equivalent function `reverse`.
 
     `reason_against_second`: why there is no second derivative with reverse mode.
     """
@@ -138,7 +138,8 @@ def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -
 
 
 def with_rules(run: Callable, rules: Rules) -> Callable:
-    """Return `run`, which JAX cannot differentiate, with derivatives by rules: both modes, to second order.
+    """Return `run`, which JAX cannot differentiate, with first and second derivatives in both
+    modes by `rules`.
 
     It takes trees of arrays and other objects, and returns trees of arrays.
     """
@@ -180,7 +181,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 
 
 def _without_gaps(found, rates: list):
-    """Return the tangents of all arrays of `found`: `rates` of the real ones, zeros for integers."""
+    """Return the tangents of all arrays of `found`: `rates` for real arrays, zeros for integer arrays."""
     left = iter(rates)
     return jax.tree.map(
         lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found

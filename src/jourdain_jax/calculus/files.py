@@ -120,7 +120,9 @@ def parsed(parse: Callable, content, source: str, what: str):
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
-    """Raise a ValueError for nesting deeper than `DEEPEST`. `inner` returns the inner values of a value."""
+    """Raise a ValueError for nesting deeper than `DEEPEST`. `inner(value)`: the values nested
+    directly in a value.
+    """
     level = [root]
     for _ in range(DEEPEST):
         level = [thing for holder in level for thing in inner(holder)]

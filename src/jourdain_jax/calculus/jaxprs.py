@@ -36,8 +36,8 @@ def evaluated(
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """Return `closed` with only the equations that some outputs need, also inside calls. `outputs`: their
-    indices (default: all).
+    """Return `closed` without the equations that its outputs do not need, also inside calls. `outputs`:
+    indices of the outputs to keep (default: all).
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
@@ -47,7 +47,7 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
-    """Return the function that a primitive calls; None for a primitive that does anything else."""
+    """Return the function that a primitive calls; None if it calls none."""
     if name not in _CALLS:
         return None
     found = params[_CALLS[name]]

@@ -76,7 +76,9 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """Return the map for a batch. `axes`: batch axis of each array of `at`; mapped arrays have it first."""
+    """Return the map for a batch. `axes`: batch axis of each array of `at`; in the arrays that are mapped it
+    comes first.
+    """
     transposed = own.transposed
 
     def along(which: list[int]) -> LinearMap | None:
@@ -202,7 +204,9 @@ class BothWays(NamedTuple):
     places: list[int]  # of the real numbers among the results
 
     def pushes(self, moving: list[int]) -> LinearMap:
-        """Return the map of tangents of the leaves, at the leaves and the result."""
+        """Return the Jacobian-vector product as a linear map of the tangents of the moving leaves. It depends
+        on the leaves and the result.
+        """
 
         def pushed(at, along):
             return self.rates(moving)(list(at[: len(self.leaves)]), *along)

@@ -50,8 +50,8 @@ def identity(name: str) -> Primitive:
 
 
 def lanes_first(tree):
-    """Return the tree; under `vmap` the batch axis of every array becomes the first. Values without a tangent
-    space pass through.
+    """Return the tree unchanged, but let `vmap` move the batch axis of every array to the front. Arrays
+    without a tangent space (float0) keep their axes.
     """
     leaves, treedef = jax.tree.flatten(tree)
     moved = [i for i, x in enumerate(leaves) if x.dtype != jax.dtypes.float0]
@@ -154,7 +154,7 @@ def _seen(*tangents, look: Callable):
 
 
 def _seen_in_batch(tangents, dims, *, look: Callable):
-    """Process several directions at once, from `jacfwd`."""
+    """Pass all directions of a `jacfwd` to `look` at once."""
     if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
         look(
             [
@@ -191,7 +191,9 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
 
 @jax.custom_jvp
 def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
-    """Return these arrays, and for `left` a zero whose derivative counts nonzero derivatives."""
+    """Mark the arrays at the start of a computation. Return them, and for `left` a zero whose derivative
+    counts nonzero derivatives.
+    """
     *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
     return each, asked
 
@@ -200,8 +202,8 @@ def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
 def left(
     asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]
 ) -> list[Array]:
-    """Return the arrays `each`. `failed`: which samples failed, along their first axes; `asked`: the zero
-    from `entered`.
+    """Mark and return the arrays `each` at the end of a computation. `failed`: which samples failed, along
+    the first axes; `asked`: the zero from `entered`.
     """
     return lanes_first([*each, *failed, asked])[: len(each)]
 
@@ -248,7 +250,7 @@ def _any(m, x, lanes):
 
 
 def _over(counts, x):
-    """Return the counts, shaped to broadcast over x."""
+    """Return the sum of the magnitudes of `counts`, shaped to broadcast over x."""
     count = sum(map(abs, counts))
     return count.reshape((*count.shape, *[1] * (x.ndim - count.ndim)))
 

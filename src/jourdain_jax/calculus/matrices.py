@@ -8,9 +8,9 @@ The formula of A+ is from G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1
 Differentiating the factorisation would divide by differences of singular values, which are zero for the
 orthonormal rows of rolling and skating.
 
-The formula of the basis Z omits its rotation within the null space, which LAPACK chooses arbitrarily. Results
-that are invariant under rotations Z -> Z R do not depend on it. The derivative of Z itself is wrong: do not
-let a basis leave the function that uses it.
+The formula of the basis Z omits its rotation within the null space, which LAPACK chooses arbitrarily. The
+derivative of Z itself is therefore wrong, but derivatives of results that are invariant under rotations Z ->
+Z R are right. Return only such results from a function that uses a basis.
 
 For static shapes, a basis has as many columns as `A`. Columns outside the null space are zero, and `present`
 identifies the others.
@@ -53,7 +53,7 @@ def _pseudo_inverse_jvp(cutoff, primals, tangents):
 
 
 def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Return the singular values of `A`, largest first. They are a diagnostic without derivative."""
+    """Return the singular values of `A`, largest first, as a diagnostic without derivative."""
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)
     return jnp.linalg.svd(jax.lax.stop_gradient(A), compute_uv=False)
@@ -86,8 +86,8 @@ def null_space_qr(
 
 
 def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Return the magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first. They
-    are a diagnostic without derivative.
+    """Return the magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first, as a
+    diagnostic without derivative.
     """
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)

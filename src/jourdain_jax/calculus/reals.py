@@ -257,7 +257,7 @@ def largest(x, axis: int | Indices | None = None, keepdims: bool = False):
 
 
 def all_finite(x, axis: int | Indices | None = None):
-    """Return whether concrete numbers are finite, all of them or along axes."""
+    """Return whether all concrete numbers of an array, or all along the given axes, are finite."""
     return np.isfinite(x).all(axis)
 
 

@@ -40,7 +40,7 @@ Unknowns = Float[Array, "unknowns"]
 
 
 class Root(eqx.Module):
-    """End of an iteration, and whether it is a root."""
+    """The last iterate, and whether it is a root."""
 
     x: Unknowns
     converged: Flag
@@ -90,7 +90,7 @@ def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
 
 
 class Nearest(eqx.Module):
-    """End of a search and the residual there."""
+    """The end point of a search, and the residual there."""
 
     x: Unknowns
     left: Scalar  # largest residual

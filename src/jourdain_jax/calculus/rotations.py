@@ -40,7 +40,9 @@ def _angle(angle: Number) -> Scalar:
 
 
 def _turned(angle: Number, rows: Callable) -> Matrix3:
-    """Return the matrix with these rows, functions of (cosine, sine, zero, one)."""
+    """Return the rotation matrix for an `angle` in rad. `rows`: function from (cosine, sine, zero, one) to
+    the rows of the matrix.
+    """
     angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([jnp.stack(row) for row in rows(c, s, jnp.zeros_like(c), jnp.ones_like(c))])
@@ -113,7 +115,7 @@ def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Flo
     """Return unit quaternions (w, x, y, z), with either sign, of concrete rotation matrices, body to space.
 
     The diagonal gives the largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2. The other components are sums and
-    differences of entries, divided by its root (Shepperd 1978).
+    differences of entries, divided by the root of that largest number (Shepperd 1978).
     """
     R = np.asarray(rotations, float)
     trace = np.trace(R, axis1=1, axis2=2)

@@ -23,37 +23,37 @@ def with_bound(value: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and bounds."""
+    """Split an array into its values and their bounds."""
     half = len(x) // 2
     return x[:half], x[half:]
 
 
 def sum_(x, y):
-    """a + b"""
+    """Return a + b with its bound."""
     both, half = x + y, len(x) // 2
     both[half:] += EPS * np.abs(both[:half])
     return both
 
 
 def difference(x, y):
-    """a - b"""
+    """Return a - b with its bound."""
     (a, ea), (b, eb) = halves(x), halves(y)
     return with_bound(a - b, ea + eb)
 
 
 def negative(x):
-    """-a"""
+    """Return -a with its bound."""
     return np.concatenate([-x[: len(x) // 2], x[len(x) // 2 :]])
 
 
 def product(x, y):
-    """a b"""
+    """Return a b with its bound."""
     (a, ea), (b, eb) = halves(x), halves(y)
     return with_bound(a * b, np.abs(a) * eb + (np.abs(b) + eb) * ea)
 
 
 def quotient(x, y):
-    """a/b"""
+    """Return a/b with its bound."""
     (a, ea), (b, eb) = halves(x), halves(y)
     value, size = a / b, np.abs(b)
     error = (ea + np.abs(value) * eb) / size * (1 + 2 / LOST)
@@ -61,8 +61,8 @@ def quotient(x, y):
 
 
 def root(x):
-    """Return the square root of a. Twice its slope, 1/sqrt(a), times e_a bounds the error, even for a below
-    e_a.
+    """Return the square root of a with the bound e_a/sqrt(a). It is twice the first-order bound, and holds
+    even for a below e_a.
     """
     a, ea = halves(x)
     value = np.sqrt(a)
@@ -72,7 +72,7 @@ def root(x):
 
 
 def wave(function: Callable) -> Callable:
-    """Return sine or cosine with a bound: their slopes and values lie between -1 and 1."""
+    """Return sine or cosine with the bound min(e_a, 2), since slopes and values lie between -1 and 1."""
 
     def bounded(x):
         a, ea = halves(x)
@@ -82,7 +82,7 @@ def wave(function: Callable) -> Callable:
 
 
 def tangent(x):
-    """tan a, whose derivative is 1 + tan(a)^2"""
+    """Return tan a with its bound; its derivative is 1 + tan(a)^2."""
     a, ea = halves(x)
     value = np.tan(a)
     return with_bound(value, 2 * (1 + value**2) * ea)

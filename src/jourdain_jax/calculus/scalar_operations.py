@@ -18,7 +18,7 @@ from jourdain_jax.calculus import round_off
 
 @dataclass(frozen=True)
 class Operation:
-    """Scalar function."""
+    """A scalar function of the table."""
 
     name: str
     value: Callable  # of NumPy arrays, elementwise
@@ -40,7 +40,7 @@ class Operation:
 
     @property
     def in_jax(self) -> Callable:
-        """Return the function of JAX arrays."""
+        """Return the function that evaluates the operation on JAX arrays."""
         return self.traced or getattr(jnp, self.value.__name__)
 
     @property

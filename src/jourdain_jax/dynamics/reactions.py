@@ -1,11 +1,12 @@
-"""Constraint forces by constraint and by body, and the forces in rolling contacts (rows S1 and S4).
+"""Constraint forces by constraint and by body, and the forces in rolling contacts (S1 and S4 of
+docs/paper_by_example.md).
 
     force    R_j^s = lambda_s d phi_s/d v_j          on body j
     torque   T_j^s = lambda_s d phi_s/d omega_j      about its mass centre
     direct   lambda_s d phi_s/d u at fixed v, omega  on the speeds themselves
 
 The constraints are functions of the velocities in a `Motion`, so one reverse pass per row gives the forces on
-all bodies. Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
+all bodies. All vectors are in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
 """
 
 import equinox as eqx
@@ -131,8 +132,8 @@ def contact_forces(
 
     The tangential force is the multiplier of the no-slip constraints. With `height="row"` the normal force is
     the multiplier of the height constraint. With `height="coordinates"` it follows from the balance of forces
-    and moments (S1) of the bodies that the contact carries. The balance of forces is `sum N n = sum (m a - F
-    - R)`, with sums over all contacts of these bodies, and over the bodies.
+    and moments of the bodies that the contact carries. The balance of forces is `sum N n = sum (m a - F -
+    R)`, with sums over all contacts of these bodies, and over the bodies.
 
     If the balance does not determine the normal force (four wheels on a plane), the force has minimum norm,
     and `determined` is False. `determined` is also False if a moment remains that no contact can exert, such

@@ -50,7 +50,7 @@ class AdmissibleRates(eqx.Module):
 
 
 class Dependence(eqx.Module):
-    """Dependence of quantities on coordinates (columns) at any of the probed states."""
+    """Which quantities depend on which coordinates (columns), at any of the probed states."""
 
     cyclic_quantities: Bool[
         np.ndarray, "coordinates"
@@ -128,7 +128,7 @@ def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
 @eval_numpy
 def _probe(scene: Scene, t, q, u, shifts):
     """Return quantities by name at every state, first without displacement and then with each coordinate
-    displaced alone. Also return which coordinates have one speed as their rate.
+    displaced alone. Also return which coordinates have one of the speeds as their rate.
     """
 
     def one(t, q, u, shifts):

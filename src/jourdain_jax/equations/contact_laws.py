@@ -124,7 +124,7 @@ class Law(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Forces of all contacts, their modes, and whether both satisfy the law, by contact."""
+    """Forces and modes of all contacts, and whether they satisfy the law, by contact."""
 
     P: Float[Array, "contacts 3"]
     modes: Modes
@@ -138,14 +138,14 @@ def coulomb(law: Law) -> Solution:
         w_n >= target and P_n >= 0, one of them with equality;
         w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
 
-    Projected Gauss-Seidel sweeps come first. Then Newton's method solves the equations of the modes for
-    forces and directions, which also give the derivatives. Before each step it chooses the modes by the signs
-    of
+    Projected Gauss-Seidel sweeps come first. Then Newton's method solves the equations of the modes
+    for forces and directions, which also give the derivatives. Before each step it chooses the modes
+    by the signs of
 
         N = P_n - (w_n - target)/G_nn,   |T| - mu_s N with T = P_t - w_t/tr G_tt
 
-    Redundant contacts keep their shares from the sweeps. Source: P. Alart and A. Curnier, Comput. Methods
-    Appl. Mech. Eng. 92 (1991) 353.
+    If contacts are redundant, the sweeps decide how they share the load. Source: P. Alart and A. Curnier,
+    Comput. Methods Appl. Mech. Eng. 92 (1991) 353.
     """
     count = len(law.target)
     P = jnp.zeros((count, 3), law.b.dtype)
@@ -160,7 +160,9 @@ def coulomb(law: Law) -> Solution:
 
 @partial(jax.jit, static_argnums=2)
 def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "contacts 3"]:
-    """Return the forces after one sweep at contact j: its force by the law, with the other forces given."""
+    """Return the forces after one Gauss-Seidel step at contact j: its force by the law, for the given
+    other forces.
+    """
     normal, tangential = _scales(law.G)
     w = law.G[3 * j : 3 * j + 3] @ P.ravel() + law.b[3 * j : 3 * j + 3]
     N = jnp.where(law.touches[j], jnp.maximum(P[j, 0] - (w[0] - law.target[j]) * normal[j], 0.0), 0.0)

@@ -54,8 +54,8 @@ class SwitchingRow(NamedTuple):
 
 
 def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
-    """Return the contacts with friction and the constraints with a limit of force, in the order of their
-    modes.
+    """Return the contacts with friction and the constraints with a force limit, in the order of
+    their modes.
     """
     contacts = contacts_of(scene, motion.pose())
     found = {
@@ -98,8 +98,8 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
 ) -> tuple[Load, ...]:
-    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a limit
-    of force give the forces A' L on the speeds.
+    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a force
+    limit give the forces A' L on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

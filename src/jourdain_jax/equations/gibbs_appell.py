@@ -60,8 +60,8 @@ def _gradient_and_hessian(f, x):
 class GibbsAppell(eqx.Module):
     """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
 
-    `independent`: indices of the privileged speeds. The reduction applies where they determine the other
-    speeds.
+    `independent`: indices of the privileged speeds. The reduction applies where the constraints determine all
+    other speeds from these.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)

@@ -49,7 +49,9 @@ def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "c
 
 
 def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coordinates"]:
-    """Return `N'` of `qdot = N u + nu`, one row for each user-defined speed; no rows for default speeds."""
+    """Return `N'` of `qdot = N u + nu`, one row for each user-defined speed; without such speeds it
+    has no rows.
+    """
     if scene.speeds is None:
         return jnp.zeros((0, len(scene.coordinate_names)))
     return jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(jnp.zeros(len(scene.speed_names))).T

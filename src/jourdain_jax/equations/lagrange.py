@@ -1,4 +1,5 @@
-"""Lagrange's equations in energy-derivative form, for scenes whose speeds are the coordinate rates (row S2).
+"""Lagrange's equations in energy-derivative form, for scenes whose speeds are the coordinate rates (S2 of
+docs/paper_by_example.md).
 
     d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
 

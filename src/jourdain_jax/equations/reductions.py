@@ -157,7 +157,7 @@ class Partition(eqx.Module):
 
     @property
     def C(self) -> Float[Array, "speeds freedoms"]:
-        """Return the matrix of all speeds per independent one."""
+        """Return C, the derivative of all speeds with respect to the independent ones."""
         B = self._solved(-self.A[:, np.array(self.independent, int)])
         return self.all_from(jnp.eye(len(self.independent), dtype=B.dtype), B)
 

@@ -95,8 +95,8 @@ def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
-    """Return rates of named `values` of a pose along the motion, as functions of the velocities of the
-    bodies.
+    """Return the rates of named `values` of a pose along the motion, computed from the velocities
+    of the bodies.
     """
 
     names: list[str] = []

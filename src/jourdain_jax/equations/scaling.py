@@ -43,8 +43,8 @@ def row_scale(
     """Return the reciprocal length of each row, or of its `typical` length if that is longer; 1 for a zero
     row without a typical length.
 
-    So a row that shrinks along a motion is also short after scaling. It counts as zero at the round-off of
-    its typical length.
+    So a row that becomes shorter than its typical length has a length below 1 after scaling. It counts as
+    zero at the round-off of its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
     if typical is not None:

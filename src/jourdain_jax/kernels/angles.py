@@ -1,18 +1,18 @@
-"""Sine, cosine, tangent and their inverses for vectors of doubles, by polynomials and double-double
-arithmetic.
+"""Sine, cosine, tangent and their inverses for vectors of doubles, by polynomials and
+double-double arithmetic.
 
-An angle loses its whole quarter turns, with pi/2 in the three parts of `program/emit.py`; a remainder in two
-parts is left. This is exact while the multiple of pi/2 has 20 bits. Larger angles are multiplied by the
-relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and cosine use the
+Whole quarter turns are subtracted from an angle, with pi/2 in the three parts of `program/emit.py`; the
+remainder has two parts. This is exact while the multiple of pi/2 has 20 bits. Larger angles are multiplied by
+the relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and cosine use the
 minimax polynomials of `program/emit.py`. Arcs use Chebyshev polynomials P of 12 and 13 terms, from mpmath's
 `chebyfit`, which a test reproduces:
 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
     asin s = s + s^3 P(s^2) for |s| < 1/2,         otherwise   asin s = pi/2 - 2 asin sqrt((1 - s)/2)
 
-Errors are below 0.9 ulp. In a double-double number, the low part holds the round-off of the head. Sources:
-T. J. Dekker, Numerische Mathematik 18 (1971) 224; J.-M. Muller et al., Handbook of Floating-Point
-Arithmetic (2018), chapter 4.
+Errors are below 0.9 ulp. In a double-double number, the low part holds the round-off of the head. Sources: T.
+J. Dekker, Numerische Mathematik 18 (1971) 224; J.-M. Muller et al., Handbook of Floating-Point Arithmetic
+(2018), chapter 4.
 """
 
 import math
@@ -75,8 +75,8 @@ def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     return q, (product_less(w, q, b[0], a[0]) + (q * b[1] - a[1])) * inverse
 
 
-WHOLE = 1.5 * 2.0**52  # adding this rounds to an integer, which the last bits of the sum hold
-LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
+WHOLE = 1.5 * 2.0**52  # adding this rounds to an integer, held in the last bits of the sum
+LARGEST_ANGLE = 5e5  # rad; products of a part of 33 bits and a multiple of pi/2 below 2^20 are exact
 _HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 _LESS_SINE = tuple(-c for c in SINE)
 _PI = (3.1415926535897896, 3.675178358715236e-15)  # the head has 50 bits, so 1/4, 1/2 and 3/4 of it are exact

@@ -1,11 +1,11 @@
 """Machine code as a function of JAX: the call frame of XLA's foreign function interface, registered handlers,
 and distribution of lanes over threads.
 
-Layouts are the ones of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header shipped with
-jaxlib states its version. Another major version, or frames with other members, are not supported.
+Layouts are as in `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header shipped with jaxlib
+states its version. Another major version, or frames with other members, are not supported.
 
-Machine code works in double precision. XLA converts arrays in single precision before and after a call,
-so results are rounded once.
+Machine code works in double precision. XLA converts arrays in single precision before and after a call, so
+results are rounded once.
 """
 
 import ctypes
@@ -73,7 +73,7 @@ def reason_against() -> str:
 
 
 def devices() -> str:
-    """Return text for display on the devices of machine code; empty if the CPU is the only one."""
+    """Return the devices of machine code as text for display; empty if the CPU is the only one."""
     return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
 
 
@@ -100,7 +100,7 @@ def _members(header: str, struct: str) -> str:
 
 
 class Given(NamedTuple):
-    """Argument of a handler."""
+    """An array that is passed to a handler."""
 
     data: Value  # pointer
     sizes: Value  # pointer to the sizes of its axes
@@ -113,8 +113,8 @@ def last_size(w: Writer, x: Given) -> Value:
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
-    """Return the product of the sizes of all axes except the last `but` (1 or 3). The host computes it for a
-    GPU, which loads it.
+    """Return the product of the sizes of all axes except the last `but` (1 or 3). A GPU loads the product
+    that the host has computed.
     """
     if w.device:
         return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
@@ -295,8 +295,8 @@ class OfLane(NamedTuple):
 
 
 def of_lane(w: Writer, array: Value, count: Value, numbers: Value | int, lane: Value) -> OfLane:
-    """Return the numbers of one of `count` lanes in an array. On a CPU they are contiguous; on a GPU lanes
-    come last, because neighbouring threads begin and save together and then access neighbouring words.
+    """Return the numbers of one of `count` lanes in an array. On a CPU they are contiguous. On a GPU lanes
+    come last: neighbouring threads, which begin and save together, then access neighbouring words.
     """
     if w.device:
         return OfLane(w.at(array, lane, "double"), count)

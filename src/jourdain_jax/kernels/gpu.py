@@ -1,13 +1,14 @@
 """Kernels of NVIDIA GPUs as functions of JAX. A handler on the host, compiled for the CPU, launches each
 kernel on XLA's stream.
 
-One handler serves all kernels. A call has the number of its kernel, and a table of this process maps the
+One handler serves all kernels. A call carries the number of its kernel, and a table of this process maps the
 number to the loaded kernel. The kernel receives four words for each array: its address, the size of the last
 axis, and two products of sizes, of all axes but the last one and of all but the last three. The last result
 is the lane counter of the call. Layouts are as in `ffi.py`.
 
-Reverse mode has a record of steps. Its size follows from the number of trial steps of the motions, which the
-forward call has counted: the handler waits for that number and allocates the record by XLA's allocator.
+In reverse mode a kernel keeps a record of steps. Its size follows from the number of trial steps of the
+motions, which the forward call has counted: the handler waits for that number and allocates the record by
+XLA's allocator.
 """
 
 import ctypes
@@ -39,7 +40,7 @@ _kernels: dict[int, nvidia.Loaded] = {}
 
 
 class Kernel(NamedTuple):
-    """Kernel that can be called."""
+    """A loaded kernel, ready to be called."""
 
     number: int
     loaded: nvidia.Loaded
@@ -80,7 +81,9 @@ def handler_text() -> str:
         function = w.load(table, w.load(entry, type="i64") + _FUNCTION, "ptr")
 
         def asked(of_interface: int, *fields: Value | int) -> Value:
-            """Call a function of XLA, return its error if it fails, and return its last field."""
+            """Call a function of XLA and return the last field of its arguments. If it fails, the handler
+            returns its error.
+            """
             last, struct = len(fields) + 1, w.room(len(fields) + 2, "i64")
             for word, value in enumerate((8 * (last + 1), 0, *fields)):
                 w.store(w.literal(value, "i64"), struct, word)

@@ -87,8 +87,8 @@ def reason_against() -> str:
 
 @functools.cache
 def features() -> dict[str, bool]:
-    """Return the features of the processor. LLVM reports none for Apple's; every 64-bit ARM processor has
-    vector registers and fused multiply-add.
+    """Return the features of the processor. LLVM reports none for Apple's processors; like every 64-bit ARM
+    processor they have vector registers and fused multiply-add.
     """
     found = dict(llvm.get_host_cpu_features())
     return found | {"neon": True} if llvm.get_process_triple().startswith(("aarch64", "arm64")) else found
@@ -246,7 +246,7 @@ def _read(file: Path) -> bytes:
 
 
 def _make_room(place: Path) -> None:
-    """Remove the oldest files if all of them exceed `MOST_BYTES`."""
+    """Remove the oldest files if all files together exceed `MOST_BYTES`."""
     found = sorted((file.stat().st_mtime, file.stat().st_size, file) for file in place.glob("*.o"))
     excess = sum(size for _, size, _ in found) - MOST_BYTES
     for _, size, file in found:

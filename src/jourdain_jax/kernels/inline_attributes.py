@@ -8,7 +8,9 @@ from collections import Counter
 
 
 def with_inlining(text: str) -> str:
-    """Return the module with small functions and functions called once marked for inlining, others not."""
+    """Return the module with small functions and functions called once marked for inlining, and the others
+    marked against it.
+    """
     parts = {
         found[1]: found[0]
         for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)

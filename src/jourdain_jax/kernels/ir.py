@@ -21,8 +21,8 @@ class Writer:
     """Builder of a module of functions on vectors of `lanes` doubles.
 
     `fused`: whether `fma` rounds once; `threads`: number of threads that share the lanes on a CPU; `device`:
-    whether the module is for a GPU. `record`: for a GPU, the doubles of a slot of the record of steps (0: no
-    record) and the most bytes of all slots.
+    whether the module is for a GPU. `record`: for a GPU, the number of doubles per slot of the record of
+    steps (0: no record) and the maximum number of bytes of all slots.
     """
 
     eps = 2.0**-52
@@ -283,8 +283,8 @@ class Writer:
         )
 
     def together(self, a: Value) -> Value:
-        """Return whether a value is true in any thread of a warp, whose threads wait here; on a CPU, the
-        value.
+        """Return whether a value is true in any thread of a warp, whose threads wait here for each other; on
+        a CPU, the value itself.
         """
         everyone = self.literal(-1, "i32")
         return self.external("llvm.nvvm.vote.any.sync", "i1", everyone, a) if self.device else a
@@ -332,7 +332,9 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """Return a value reloaded from memory, which needs no register until then; on a GPU, the value."""
+        """Return a value reloaded from memory, so that it needs no register until then; on a GPU, the
+        value itself.
+        """
         if self.device or not value.place:
             return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}")

@@ -105,7 +105,7 @@ def _of_device(attribute: int) -> int:
 
 
 def _capabilities() -> list[int]:
-    """Return the compute capabilities, times ten, whose code runs on all devices: equal or older ones."""
+    """Return the compute capabilities, times ten, that all devices support."""
     major, minor = 75, 76  # attributes of a device
     own = [
         10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device)
@@ -140,7 +140,7 @@ def text_for(module: str, architecture: str) -> str:
 
 @contextmanager
 def _in_context() -> Iterator[None]:
-    """Run the enclosed code in JAX's context of its first device."""
+    """Run the enclosed code in the CUDA context of JAX's first device."""
     context = ctypes.c_void_p()
     _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), _devices()[0]))
     _checked(driver().cuCtxPushCurrent_v2(context))
@@ -167,8 +167,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for these `lanes`: at most as many as registers allow and as local memory
-    fits the first-level cache, but at least four per multiprocessor.
+    """Return the number of warps for these `lanes`: at most as many as the registers allow and as have their
+    local memory in the first-level cache, but at least four per multiprocessor.
     """
     # attributes of a device: 16 its multiprocessors; of each of them 82 the registers, 81 the cache usable as
     # shared memory, 106 the maximum number of blocks

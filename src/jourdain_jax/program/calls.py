@@ -46,7 +46,7 @@ class Call:
 
     @property
     def loop(self) -> str:
-        """Return the name of the first loop in it, or an empty string."""
+        """Return the name of the first loop in the call, or an empty string."""
         return next(loops(self.closed.jaxpr), "")
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
@@ -142,8 +142,8 @@ _SEVERAL = tuple, list  # defined once, because writing a union creates a new ty
 
 
 def description(x) -> Hashable:
-    """Return a key of a jaxpr or of a primitive's parameter. Two traces of a function have equal keys, unless
-    it creates other functions.
+    """Return a hashable key of a jaxpr or of a primitive's parameter. Two traces of a function have equal
+    keys, unless it creates other functions.
     """
     if isinstance(x, _SEVERAL):
         return tuple(map(description, x))

@@ -42,8 +42,8 @@ def _of_all(graph: Graph, op: str, entries: list[int]) -> int:
 
 
 def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
-    """Return the extreme of more than two numbers, written as the mean of the numbers that equal it. Its
-    derivative is then the mean of their derivatives, as in JAX.
+    """Rewrite the extreme of more than two numbers as the mean of the numbers that equal it. Its derivative
+    is then the mean of their derivatives, as in JAX.
     """
     reached = [graph.call("eq", entry, extreme) for entry in entries]
     total = graph.total(

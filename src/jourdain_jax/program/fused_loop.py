@@ -14,7 +14,9 @@ from jourdain_jax.calculus.markers import identity
 
 
 def fused(values: tuple) -> tuple:
-    """Return the given real values unchanged, but computed in one loop. All must have one shape and type."""
+    """Return the given real values unchanged, but computed in one loop. All must have the same
+    shape and type.
+    """
     return values if len(values) < 2 else tuple(fused_p.bind(*values))
 
 

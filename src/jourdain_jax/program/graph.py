@@ -34,8 +34,8 @@ class Graph:
     """Graph whose nodes are integers. `op[n]` and `args[n]` are the operation and the arguments of node n,
     `value[n]` is the number of a constant, the name of an input, or a call.
 
-    `most_multiplications`: of a matrix product; larger products stay calls. `keeps_rules`: whether functions
-    with a custom derivative stay calls.
+    `most_multiplications`: maximum number of multiplications in a matrix product; larger products stay calls.
+    `keeps_rules`: whether functions with a custom derivative stay calls.
     """
 
     def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
@@ -71,13 +71,15 @@ class Graph:
     # leaves
 
     def const(self, value) -> int:
-        """Return a constant."""
+        """Return the node of a constant."""
         value = float(value)
         # a single zero and a single NaN
         return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)
 
     def input(self, name: str, varies: bool) -> int:
-        """Return a named input: a parameter or, with `varies`, time, a coordinate, speed or scene input."""
+        """Return the node of an input: a parameter or, with `varies`, time, a coordinate, speed or
+        scene input.
+        """
         return self._node("input", (), name, varies)
 
     def is_const(self, node: int) -> bool:
@@ -91,7 +93,7 @@ class Graph:
     # arithmetic
 
     def neg(self, a: int) -> int:
-        """-a"""
+        """Return -a."""
         op, args = self.operation(a)
         if op == "const":
             return self.const(-self.value[a])
@@ -102,7 +104,7 @@ class Graph:
         return self._node("neg", (a,))
 
     def add(self, a: int, b: int) -> int:
-        """a + b"""
+        """Return a + b."""
         if a == self.zero:
             return b
         if b == self.zero:
@@ -151,7 +153,7 @@ class Graph:
         return factors
 
     def sub(self, a: int, b: int) -> int:
-        """a - b"""
+        """Return a - b."""
         if b == self.zero:
             return a
         if a == self.zero:
@@ -175,7 +177,7 @@ class Graph:
         return self._node("sub", (a, b))
 
     def mul(self, a: int, b: int) -> int:
-        """a b"""
+        """Return a b."""
         if a == self.zero or b == self.zero:
             return self.zero
         if a == self.one:
@@ -204,7 +206,7 @@ class Graph:
         return self._node("mul", (a, b))
 
     def div(self, a: int, b: int) -> int:
-        """a / b"""
+        """Return a / b."""
         if self.op[b] == "const" and self.value[b] != 0:
             if self.op[a] == "const":
                 return self.const(self.value[a] / self.value[b])
@@ -234,7 +236,7 @@ class Graph:
         return result
 
     def call(self, op: str, *args: int) -> int:
-        """Return a function of scalars by name; a constant if all arguments are constants."""
+        """Return the node of a scalar function, given by name; a constant if all arguments are constants."""
         if op in ARITHMETIC:
             return getattr(self, op)(*args)
         if all(self.op[a] == "const" for a in args):
@@ -266,7 +268,7 @@ class Graph:
         return self._node("array", entries, (shape, dtype))
 
     def opaque(self, call, operands: Iterable[int]) -> int:
-        """Return a call of arrays."""
+        """Return the node of a call with these arrays as operands."""
         return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> NodeList:

@@ -38,7 +38,7 @@ _KEPT: Mapping[str, float] = MappingProxyType({})
 
 
 class Bounded(np.ndarray):
-    """Values with round-off bounds, infinite where a value is meaningless."""
+    """Values with round-off bounds; where a value is meaningless, its bound is infinite."""
 
     error: np.ndarray
 
@@ -149,7 +149,7 @@ def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[in
 
 def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:
     """Return whether the vectors `a`, shape (probes, entries), are linear combinations of the `rows`, shape
-    (probes, rows, entries), at all meaningful probes.
+    (probes, rows, entries), at all probes with finite values.
     """
     said = (
         np.isfinite(a).all(axis=1)

@@ -136,10 +136,12 @@ def refuse(equation) -> None:
 
 
 def own_rule(name: str, params) -> str:
-    """Return the name of a function with a custom derivative that the graph lacks; empty for other functions.
+    """Return the name of a primitive's function if it has a custom derivative that the graph cannot
+    reproduce, otherwise an empty text.
 
     Functions of this package do not count: their custom derivatives equal those of their operations.
-    Functions of JAX count: `softplus` and `sinc` have branches, whose derivatives are wrong where they meet.
+    Functions of JAX do: `softplus` and `sinc` have branches, and derivatives of branches are wrong
+    where these meet.
     """
     if name == "stop_gradient":
         return "`stop_gradient`, which sets its derivative to zero,"

@@ -159,8 +159,8 @@ def _round(equation, x):
 
 
 def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
-    """Return the operands of `dot_general` as matrices with batch axes first. Their product is its result up
-    to shape.
+    """Return the operands of `dot_general` as matrices with batch axes first. The result is their matrix
+    product, to be reshaped.
     """
     (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]

@@ -104,7 +104,9 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
-    """Append all equations, also of inner jaxprs without a custom derivative; return the outputs."""
+    """Append all equations to `steps`, also of inner jaxprs without a custom derivative; return
+    the outputs.
+    """
 
     def results(equation, inputs: list) -> list:
         name = equation.primitive.name

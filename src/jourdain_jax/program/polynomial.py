@@ -55,7 +55,7 @@ class NormalForms:
         return self._simplified[node]
 
     def all_simplified(self, nodes: Iterable[int]) -> NodeList:
-        """Return every node `simplified`."""
+        """Return `simplified` of every node."""
         return [self.simplified(n) for n in nodes]
 
     def _smaller(self, node: int) -> int:
@@ -166,8 +166,8 @@ class NormalForms:
         return self._atom(value) if self.graph.op[value] == "abs" else self.expanded(value)
 
     def _magnitude(self, node: int) -> Polynomial:
-        """Return |x| of a factor extracted from a root. Sines and cosines, as in lengths of contacts, have
-        the sign of the probes, which is guarded.
+        """Return |x| of a factor extracted from a root. Sines and cosines, as in lengths of contacts, get the
+        sign that they have at the probes, and `guards` records the node.
         """
         sign = self._sign(node) if self.graph.op[node] in ("sin", "cos") and self.graph.varies[node] else 0
         if sign == 0:

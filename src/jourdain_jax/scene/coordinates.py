@@ -36,7 +36,7 @@ class Names:
     groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
 
     def view(self, array: Float[Array, "*shape"]) -> Named:
-        """Return the array with named access."""
+        """Return `array` with access by name."""
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:

@@ -145,7 +145,9 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """Raise ValueError for a count that is not a static field: loops over a traced number fail."""
+    """Raise ValueError for an integer field that is neither static nor a parameter: traced, it could not
+    count the turns of a loop.
+    """
     for field in fields(scene):
         value, known = getattr(scene, field.name), field.metadata
         if isinstance(value, int) and not known.get("static") and not known.get("parameter"):

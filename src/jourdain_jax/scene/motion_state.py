@@ -148,7 +148,7 @@ class Motion(eqx.Module):
 
     @property
     def modes(self) -> Named:
-        """Return the inputs, among them the modes. A mode is the number of its value."""
+        """Return the inputs, which include the modes. The number of a mode is the index of its value."""
         return self.inputs
 
     def pose(self) -> Pose:

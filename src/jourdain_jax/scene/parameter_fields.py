@@ -13,8 +13,8 @@ from jourdain_jax.calculus.reals import Flag, all_finite, as_real, described, ha
 
 
 def _as_leaf(value):
-    """Return a parameter as a floating-point array. Other values stay unchanged; `check_parameters` rejects
-    them with the field's name.
+    """Return a number or an array as a floating-point array. Any other value stays unchanged, and
+    `check_parameters` rejects it with the field's name.
     """
     try:
         return as_real(value)

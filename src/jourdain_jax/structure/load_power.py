@@ -1,4 +1,6 @@
-"""Power of loads, and rates of potentials by explicit time, by inputs and by poses that move at `u = 0`."""
+"""Power of loads, and rates of potentials due to explicit time, to inputs, and to poses that
+move at `u = 0`.
+"""
 
 from collections.abc import Callable
 

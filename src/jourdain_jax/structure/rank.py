@@ -182,8 +182,8 @@ def worst_pivot(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.
 
 
 def best_privileged(scaled: np.ndarray, count: int, rank: int) -> Indices:
-    """Return the independent speeds with the largest worst pivot over all probes. The typical pivot
-    breaks ties.
+    """Return the choice of independent speeds whose smallest pivot over all probes is largest. The median
+    pivot breaks ties.
     """
     if rank == 0:
         return tuple(range(count))

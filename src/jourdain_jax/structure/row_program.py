@@ -58,7 +58,7 @@ class RowProgram:
 
     @property
     def entries(self) -> list[int]:
-        """Return the nodes of the entries of parameters that are used."""
+        """Return the nodes of all entries of parameters that the program uses."""
         return [n for leaf in self.parameters for n in leaf if n >= 0]
 
 

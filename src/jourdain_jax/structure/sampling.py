@@ -130,7 +130,7 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
     """Return configurations of zeros, with right angles (within the domain) in up to two coordinates. Scenes
-    with many coordinates get right angles in one coordinate, for some of them.
+    with many coordinates get at most one right angle, and not in all coordinates.
     """
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()

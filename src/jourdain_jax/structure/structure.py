@@ -180,7 +180,7 @@ def structure_of(scene: Scene) -> Structure:
 
 
 def structure_whatever_its_faults(scene: Scene) -> Structure:
-    """Return static facts about a scene without raising its faults."""
+    """Return static facts about a scene, without errors for its faults."""
     return _structure(as_scene(scene))
 
 

@@ -33,7 +33,7 @@ class HeldRow(eqx.Module):
 
     @property
     def slip(self) -> Float[Array, "2"]:
-        """Return the slip along the constraint; the second tangent is unused."""
+        """Return the slip in the form of contacts, with two tangents; the second entry is zero."""
         return jnp.stack([self.w, jnp.zeros_like(self.w)])
 
 
