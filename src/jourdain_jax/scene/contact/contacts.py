@@ -155,7 +155,7 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
 
     - `body`: `pose["name"]`; `radius` a in m.
 
-    Options of all rolling contacts:
+    The `options` of all rolling contacts:
 
     - `centre`: c (3,), the centre of the rolling shape in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
