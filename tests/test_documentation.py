@@ -192,8 +192,8 @@ def test_the_readme_has_at_most_five_hundred_words():
 
 def test_dips_that_may_be_missed_are_named_in_the_same_words():
     said = (
-        "smooth dip of an event's value, if shorter than the longest step, may be missed. So may a condition"
-        " such as `jnp.linalg.norm(x) < r` that holds for less time"
+        "smooth dip of an event's value that is shorter than the longest step may be missed, and so may a "
+        "condition such as `jnp.linalg.norm(x) < r` that holds only briefly"
     )
     pages = [(ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("limits.md", "howto/events.md")]
     for text in (*pages, jj.Scene.events.__doc__, jj.Event.__doc__):

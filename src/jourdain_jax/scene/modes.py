@@ -74,10 +74,9 @@ def modes(**values) -> Modes:
 class Event:
     """An event after which the motion continues. `events` returns it in place of a plain value.
 
-    - `value`: the event occurs where it falls through zero. An event may be missed if its value is below zero
-      for less time than the longest step, for example if it comes from a condition such as
-      `jnp.linalg.norm(x) < r` that holds only briefly. Use values that fall only once, or a smaller
-      `max_step`.
+    - `value`: the event occurs where it falls through zero. A smooth dip of an event's value that is shorter
+      than the longest step may be missed, and so may a condition such as `jnp.linalg.norm(x) < r` that holds
+      only briefly. Use values that fall only once, or a smaller `max_step`.
     - `to`: mode -> name of its value afterwards.
     - `jump`: coordinate or speed -> its value afterwards; all others keep their values. The new state must
       satisfy the velocity constraints.

@@ -182,9 +182,10 @@ class Scene(eqx.Module):
         If several events occur in one step, the first counts. A value may also fall through zero and rise
         again within one step. Such a dip is found if a relation in the value (`<`, `where`, `abs`, ...)
         changes. Default solvers also find it if the cubic through values and rates at the ends of the step
-        becomes negative; other adaptive solvers, if the dense output is negative at one of three times. Other
-        dips shorter than the longest step may be missed, and so may a condition such as `jnp.linalg.norm(x) <
-        r` that holds only briefly. Use values that fall only once, or a smaller `max_step`.
+        becomes negative; other adaptive solvers, if the dense output is negative at one of three times.
+        Otherwise a smooth dip of an event's value that is shorter than the longest step may be missed, and so
+        may a condition such as `jnp.linalg.norm(x) < r` that holds only briefly. Use values that fall only
+        once, or a smaller `max_step`.
         """
         return {}
 
