@@ -581,7 +581,7 @@ def test_ratios_that_show_are_told_as_such():
     found = fit(Cart(mass=1.9), cart_run(push=0.0), THREE)
     (sentence,) = found.not_identifiable
     assert "d mass/mass : d damping/damping : d stiffness/stiffness = 1 : 1 : 1" in sentence
-    assert sentence.endswith("determined is only damping mass^-1, stiffness mass^-1")
+    assert sentence.endswith("the data determine only damping mass^-1, stiffness mass^-1")
     assert np.isnan(found.standard_errors).all()
 
 
@@ -598,7 +598,7 @@ def test_a_sum_that_shows_is_told_as_one():
 
     found = fit(TwoDampers(mass=1.9, damping=0.37), cart_run(), ("mass", "damping", "second", "idle"))
     by_sum, idle = sorted(found.not_identifiable, key=lambda sentence: "idle" in sentence)
-    assert by_sum.endswith("determined is only their sum")
+    assert by_sum.endswith("the data determine only their sum")
     assert idle.startswith("no channel depends on `idle`")
     assert near(found["mass"], 2.0)
 

@@ -1,4 +1,5 @@
-"""Identification: parameters and initial values of a scene from measured motions, by nonlinear least squares.
+"""Identification of parameters and initial values of a scene from measured motions, by nonlinear least
+squares.
 
     minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma
 
@@ -7,8 +8,9 @@ computed in forward mode, run by run, and initial values of the runs are elimina
 Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989),
 chapter 3.
 
-Search for a minimum: from first guesses, over growing spans if these are far off, alternating with
-correlation times, and away from bounds.
+The search for a minimum starts from one or more first guesses. If these are far off, it fits growing spans of
+the runs. It alternates with the estimation of correlation times, and moves unknowns off their bounds if this
+helps.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -53,17 +55,17 @@ class FitFields(OptionFields, total=False):
 
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
-    """Return the minimum from each `theta`. Where there is none, or where residuals are far beyond their
-    sigmas, also fit over growing spans, and return the lower minimum.
+    """Return the minimum from each `theta`. If there is none, or if residuals are far beyond their sigmas,
+    also fit over growing spans, and return the lower minimum.
 
     Over a short span, a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
     starts at the result over the shorter span. Unknowns that a short span does not determine stay near the
-    first guess. A fit without progress far from a minimum stops, and continues only if growing spans do not
-    lead to small residuals either. For several first guesses of one problem, spans grow only if no guess led
-    to small residuals.
+    first guess. A fit that makes no progress far from a minimum is interrupted, and continued only if growing
+    spans do not lead to small residuals either. With several first guesses, growing spans are used only if no
+    guess led to small residuals.
     """
     samples, control = problem.samples, problem.asked.control
-    large = 5.0 * samples  # F: ten times the expectation for noise alone, one half per sample
+    large = 5.0 * samples  # F: ten times the expected value for noise alone, one half per sample
     impatient = samples > 0 and not (problem.single and len(theta) > 1)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
@@ -87,7 +89,7 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
         ]
         way = way.continued(some, grown)
         place[some] += 1
-        followed = problem.is_followed(grown.at, spans, 100.0)  # in squares expected from noise
+        followed = problem.is_followed(grown.at, spans, 100.0)  # times the squares expected from noise
         for k in range(1, len(spans)):
             # skip the next span if the motion follows it already
             place[some] += (place[some] == k) & followed[:, k]
@@ -161,14 +163,14 @@ def fit(
       `free=measured_bicycle("Browser").prior`; for parameters that were measured together, use
       `joint_normal(means, covariance)`. The name of a body, with `possible_inertia()`, frees its moments of
       inertia. Unknowns in `unknown_start`, sensors and actuators of the runs are free as well.
-    - `guesses`: number of first guesses, fitted as a batch. The first is the scene's and the runs'; others
-      lie on a Latin hypercube within the bounds, or within a factor of five of a `positive()` unknown. The
-      lowest minimum counts; `Fit.agreeing` is the number of guesses that led to it.
+    - `guesses`: number of first guesses, fitted as a batch. The first one comes from the scene and the runs;
+      the others lie on a Latin hypercube within the bounds, or within a factor of five of a `positive()`
+      unknown. The result is the lowest minimum; `Fit.agreeing` is the number of guesses that led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic
-      motions: the runs are fitted in pieces with their own starts, and continuity between them is an
-      equation. The objective is unchanged.
+      motions: the runs are fitted in pieces with their own starts, which are constrained to join. The
+      objective is unchanged.
 
-    By name (`by_name`):
+    Further keyword arguments (`by_name`):
 
     - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the largest count as zero
       (`Information`). Keep it well above the relative accuracy of the simulation.
@@ -181,17 +183,18 @@ def fit(
       within a run, even if the scene is slightly wrong. Unknowns of single runs still assume white noise.
     - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`.
 
-    Stop events do not cut a run: all given samples count, since otherwise a motion that ends early would have
-    fewer residuals. `Fit.warnings` names events that the fitted motion meets before a sample. Give samples up
-    to the event of the real motion.
+    The simulated motion continues beyond stop events, since otherwise a motion that ends early would have
+    fewer residuals. `Fit.warnings` names events that the fitted motion meets before a sample. Give only
+    samples before the event of the real motion.
 
     If a fit finds no minimum, or residuals far beyond their sigmas, it is repeated over growing spans, unless
     `shooting` is given. The first span is 1/32 of each run; the next ones are longer, as far as the fitted
-    motion follows the data. The first guess is then a weak prior, with its own size as sigma. This also fits
-    unstable motions. The lower minimum counts; `Fit.grown` is True if it came from growing spans.
+    motion follows the data. During this search the first guess is a weak prior, with its own size as sigma.
+    Unstable motions are fitted in this way, too. The result is the lower minimum; `Fit.grown` is True if it
+    came from growing spans.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals, residuals, the fitted scene, and
-    sentences on undetermined combinations. Given sigmas count as known. Sigmas that are None, and robust
+    undetermined combinations of unknowns. Given sigmas count as known. Sigmas that are None, and robust
     losses, give intervals of Student's t. An unknown at its bound has a one-sided interval, by profile
     likelihood. `converged` is False if no minimum was found. Runs of equal structure share one compiled
     program, independent of their number and lengths; time and memory are proportional to the number of runs.
@@ -224,11 +227,11 @@ def fit_batch(
 ) -> Fit:
     """Return the fits of many repeats of one experiment, computed as one batch.
 
-    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and
-    `by_name` as in `fit`.
+    Every array in the `values` of `data` has a leading axis `repeats`; everything else is shared. `free` and
+    `by_name` are as in `fit`.
 
-    **Returns** a `Fit` whose arrays have the leading axis. A repeat that fails, or has fewer samples than
-    unknowns, has `converged` False and does not affect the others. **Raises** errors as in `fit`.
+    **Returns** a `Fit` whose arrays have the leading axis. `converged` is False for a repeat that fails or
+    has fewer samples than unknowns; it does not affect the others. **Raises** errors as in `fit`.
     """
     return _fit(_asked(scene, free, by_name, "fit_batch"), data, repeats=True)
 
@@ -236,7 +239,7 @@ def fit_batch(
 def _asked(
     scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitFields, function: str
 ) -> Asked:
-    """Return the checked request, for one first guess of whole runs."""
+    """Return the checked arguments of a fit with one first guess and without shooting."""
     rest: dict[str, Any] = dict(by_name)
     cutoff, tolerance, most_steps = (
         rest.pop(name, value)
@@ -282,7 +285,7 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     else:
         problem = Piecewise(asked, runs, unknowns)
     found = shot(problem, theta) if isinstance(problem, Piecewise) else minimum(problem, theta)
-    # without a step it is unknown whether starts can move with the unknowns
+    # the fit made no step or failed: starts may contradict the constraints when unknowns change
     if problem.failed or not found.steps.all():
         check_starts(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
@@ -336,7 +339,9 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
-    """Return which repeats have as many measured values as unknowns. Raises ValueError if none has."""
+    """Return which repeats have at least as many measured values as unknowns. Raises ValueError if
+    none has.
+    """
     known = [
         np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats))
         for run in runs

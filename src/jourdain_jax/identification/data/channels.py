@@ -1,7 +1,8 @@
-"""Channels that are functions of a `Motion`: traced once, and equal if they compute equal values.
+"""Channels defined by functions of a `Motion`. Each function is traced once.
 
-Captured values become arguments, and operations are compared by value. A new lambda with the same operations
-is therefore the same channel, compiled once. A function whose globals have changed is a new channel.
+Two channels are equal if they perform the same operations; captured values become arguments. A new lambda
+with the same operations is therefore the same channel and is not compiled again. A function whose globals
+have changed is a new channel.
 
 Instruments for accelerations and forces: accelerometers on bodies, load cells under contacts.
 
@@ -11,7 +12,7 @@ f: reading of an accelerometer at the point P; R, r, v, omega: orientation, mass
 velocity of the body; g: gravity. Source: D. H. Titterton and J. L. Weston, Strapdown Inertial Navigation
 Technology, 2nd ed. (2004), section 3.
 
-A measured time (`value`) of the stop event that ended a run:
+The residual of a measured time (`value`) of the stop event that ended a run:
 
     r = (t_event - value) / sigma        t_event: time at which the simulated motion stops at the event
 
@@ -246,7 +247,7 @@ def _determined(scene: Scene) -> dict[str, bool]:
     }
 
 
-LATEST = 4.0  # times the observed time: a motion fails if it reaches the event later, or another event first
+LATEST = 4.0  # times the observed time: the latest permitted time of the simulated event
 
 
 class StopEvent(eqx.Module):
@@ -263,8 +264,8 @@ class StopEvent(eqx.Module):
         return StopEvent(name)
 
     def time(self, motion: Callable, t0, span) -> Scalar:
-        """Return the time at which the motion stops at the event, NaN if it does not. `motion` simulates with
-        events; `span`: from the start to the observed time.
+        """Return the time at which the motion stops at the event, or NaN if it does not. `motion(ts)`
+        simulates the run with events; `span`: time from the start to the observed event.
         """
         found = motion((t0 + LATEST * span)[None])
         return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)

@@ -15,8 +15,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentences:
-    """Return one sentence for each probable mistake in `checked` runs. Traced numbers are not examined.
-    `repeats`: values have a leading axis; only its first entry is examined.
+    """Return one sentence for each probable mistake in runs prepared by `checked`. Traced numbers are not
+    examined. `repeats`: values have a leading axis, of which only the first entry is examined.
     """
     found: list[str] = []
     for index, run in enumerate(runs):
@@ -44,9 +44,9 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> Sentenc
 def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: float) -> Iterator[str]:
     """Yield sentences on inputs whose samples do not cover a run, and on gaps in a log.
 
-    The last interval may be a jump, as for held commands; then the previous interval counts.
+    The last interval of a held command may be a jump; then the previous interval is used.
     """
-    intervals, beyond = np.diff(ts), 1.5  # allowed distance of the ends from the run's, in intervals
+    intervals, beyond = np.diff(ts), 1.5  # permitted gap at each end of the run, in intervals
     spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
     if end - ts[-1] > beyond * max(intervals[-2:]):
         spans.append(f"its last value from {ts[-1]:.6g} to {end:.6g} s")
@@ -57,7 +57,7 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
         )
     usual = float(np.median(intervals))
     (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # missing intervals
-    # share of nearly equal intervals, as in a log
+    # a log: nearly all intervals are equal
     if gaps.size and np.mean(np.abs(intervals / usual - 1) < 0.1) > 0.9:
         k = int(gaps[0])
         more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""

@@ -14,14 +14,16 @@ Priors with correlated errors, of numbers that were measured together:
 r: additional residuals; S: standard deviations; C: correlations. C = V diag(e) V' gives M = diag(e)^-1/2 V'.
 If only some of the numbers are free, S C S is their block of the covariance (the marginal).
 
-Unknowns theta within bounds as functions of any real number x, with the slope by which densities change:
+Transforms from any real number x to an unknown theta within its range, with the logarithm of the derivative
+by which densities change:
 
     unbounded  theta = x
     positive   theta = exp x
                    log |d theta / dx| = x
     bounds     theta = low + (high - low) / (1 + exp(-x))
                    log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
-    memory     a correlation time: as `bounds` for arcsin rho, rho = exp(-h / theta), h: the shortest interval
+    memory     for a correlation time: as `bounds`, applied to arcsin rho, rho = exp(-h / theta), with the
+               shortest interval h
 
 Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference
 manual of that year.
@@ -49,19 +51,19 @@ class Range:
     low: float = -np.inf
     high: float = np.inf
     scale: float | None = None
-    interval: float = 0.0  # h, s, for a correlation time
+    interval: float = 0.0  # h in s, for a correlation time
 
     def least_size(self, guess: float) -> float:
-        """Return the size of a large change of an unknown near zero: its typical change, if given; else a
-        hundredth of the first guess, or of the width of the range.
+        """Return the scale for changes of an unknown near zero: its typical change if given, else a hundredth
+        of the first guess or of the width of the range.
         """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
         return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
-        """Return another first guess for each `share` from 0 to 1. These cover the range between the bounds,
-        or without bounds a factor of five, or one typical change to either side.
+        """Return another first guess for each `share` from 0 to 1. The guesses cover the range between the
+        bounds. Without bounds they cover a factor of five, or one typical change, to either side.
         """
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
@@ -70,7 +72,7 @@ class Range:
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
-        """Return the part of the range above a lower bound, which is zero or slightly more."""
+        """Return the range restricted to values of at least `low`."""
         return replace(
             self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low)
         )
@@ -97,7 +99,7 @@ class Range:
         return jnp.log(share) - jnp.log1p(-share)
 
     def refusal(self, guess: np.ndarray) -> str:
-        """Return why a first guess cannot be used; empty if it can."""
+        """Return the reason why a first guess is invalid; empty if it is valid."""
         if np.all((self.low < guess) & (guess < self.high)):
             return ""
         if self.kind == "positive":
@@ -165,12 +167,12 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
 
     **Arguments**
     - `mean`: name -> mean, one number in the unit of the parameter.
-    - `covariance`: (n, n), in the order of the names. It may be singular: a combination without variance gets
-      a standard deviation of a ten thousandth of the others.
+    - `covariance`: (n, n), in the order of the names. It may be singular: a combination of zero variance gets
+      a ten thousandth of the standard deviation of the others.
 
     **Returns** name -> prior, for `free` of `fit`, alone or together with others:
     `free=jj.identification.joint_normal(...)
-    | {"gain": None}`. If only some of the names are free, their block of the covariance counts.
+    | {"gain": None}`. If only some of the names are free, their block of the covariance is used.
     `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
     **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or
@@ -222,8 +224,8 @@ def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
         which, sigma = [priors[k].place for k in places], np.array([priors[k].sigma for k in places])
         C = priors[places[0]].covariance[np.ix_(which, which)] / np.outer(sigma, sigma)
         e, V = np.linalg.eigh(C)
-        # least eigenvalue of correlations: an exactly known combination counts as known to a ten thousandth
-        # of the sigmas
+        # least eigenvalue of correlations: a combination of zero variance counts as known to a ten
+        # thousandth of the sigmas
         M[np.ix_(places, places)] = V.T / np.sqrt(np.maximum(e, 1e-8))[:, None]
     return M
 
@@ -235,15 +237,14 @@ class Estimate:
         jj.identification.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.studies.Normal(20.9, 0.5))})        # kg
 
-    - `guess`: the initial value of the fit, in the unit of the number. Parameters and start values have one
-      already.
+    - `guess`: the initial value of the fit, in the unit of the number; not needed for parameters and start
+      values.
     - `range`: `bounds(low, high)`, `positive()`, `unbounded()`; the default depends on the kind of number.
     - `per_run`: whether each run has its own value; otherwise all runs share it. Start values always belong
       to their run, parameters to all runs.
     - `prior`: earlier knowledge, as `Normal(mean, sigma)`; it counts as one measured value.
 
-    Raises ValueError for numbers that are not finite, for a prior that is not a `Normal`, and for a sigma of
-    zero.
+    Raises ValueError for numbers that are not finite, a prior that is not a `Normal`, and a sigma of zero.
     """
 
     guess: Any = None  # a number, or several

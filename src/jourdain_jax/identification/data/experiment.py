@@ -1,5 +1,5 @@
-"""An experiment, the measurements of one run: times, named channels with a sigma and a sensor each, start,
-and sampled inputs.
+"""An experiment: the measurements of one run. It has times, named channels, each with a sigma and a sensor, a
+start, and sampled inputs.
 
     value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
@@ -30,7 +30,7 @@ from jourdain_jax.scene.names import Labels, as_names, check_names
 
 
 class Experiment(eqx.Module):
-    """Measurements of one run of a scene; several runs are a list of these.
+    """The measurements of one run of a scene. Several runs are a list of experiments.
 
         gyro = jj.identification.Sensor("heading_rate", lag=0.01)
         sigma = {"x": 0.01, "gyro": 0.02}
@@ -42,15 +42,15 @@ class Experiment(eqx.Module):
     - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a
       name in `sensors`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the
-      shape of its values; or one number for all channels. None: unknown; one sigma for all samples of the
-      channel in all runs is estimated. NaN in `values`, the mask of a masked array, or an infinite sigma
+      shape of its values; or one number for all channels. None: unknown; `fit` estimates one sigma for all
+      samples of the channel in all runs. NaN in `values`, the mask of a masked array, or an infinite sigma
       marks a missing sample.
-    - `correlation_time`: s, of noise whose correlation falls as exp(-|t - t'| / correlation time): channel ->
-      number, or one number for all; zero, and omitted channels: white noise. None: unknown; one for all
-      components of the channel in all runs is estimated.
-    - `start`: coordinate or speed -> value at `t0`. These are fixed; missing ones are solved for, as by
-      `jj.start`.
-    - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name ->
+    - `correlation_time`: of noise whose correlation falls as exp(-|t - t'| / correlation time), in s: channel
+      -> number, or one number for all. Zero, or no entry, means white noise. None: unknown; `fit` estimates
+      one value for all components of the channel in all runs.
+    - `start`: coordinate or speed -> value at `t0`. These values are fixed; the others follow from the
+      constraints, as in `jj.start`.
+    - `unknown_start`: names in `start` whose values are first guesses and are estimated; or name ->
       `bounds(...)`, `positive()`, `unbounded()` (None: unbounded), or an `Estimate` with a prior.
     - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`; or an `Actuator`.
     - `sensors`: channel -> `Sensor`; or the quantity of an ideal sensor: a coordinate, a speed, an
@@ -59,29 +59,29 @@ class Experiment(eqx.Module):
     - `t0`: time of the start in s; default: the first of `ts`.
     - `events`: the stop event of the scene that ended the run, with its observed time and the sigma of this
       time, both in s: `events={"has_fallen": (1.83, 0.005)}`. The difference between simulated and observed
-      time is a residual. Later samples do not count.
+      time is a residual. Later samples are omitted.
 
     **Raises** ValueError for times that do not increase, infinite values, channels without values, sigmas
-    that are not positive, and unknown names. Raises it also for several events, an event before the start,
-    and samples that may refer to times before the start.
+    that are not positive, unknown names, several events, an event before the start, and samples that may
+    refer to times before the start.
     """
 
-    ts: Times  # s; all on NumPy if known
+    ts: Times  # s; this and all other known numbers are NumPy arrays
     values: dict[str, Numbers]
     sigma: dict[str, Numbers]
     start: dict[str, Numbers]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     sensors: dict[str, Sensor]
-    readings: dict[str, Reading]  # the prepared sensors; this and the next two are empty before `checked`
+    readings: dict[str, Reading]  # prepared sensors; `checked` fills this and the next two fields
     drives: dict[str, Drive]  # actuators with estimated numbers, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Entries, ""]  # s
-    # s, of channels with correlated noise; zero if to be estimated
+    # s, of channels with correlated noise; zero if it is estimated
     correlation_time: dict[str, Float[Entries, ""]]
-    unknown_sigma: Labels = static()  # channels; their sigma is 1 here
-    unknown_correlation: Labels = static()  # channels
-    ended_by: str = static()  # channel of the event with an observed time; empty: none
+    unknown_sigma: Labels = static()  # channels with estimated sigma; their `sigma` is 1 here
+    unknown_correlation: Labels = static()  # channels with estimated correlation time
+    ended_by: str = static()  # channel of the observed event time; empty if there is none
 
     def __init__(
         self,
@@ -191,11 +191,11 @@ class Experiment(eqx.Module):
                     "standard deviation of its noise"
                 )
 
-    # Equinox's own costs a microsecond per access, and a fit reads a hundred fields
+    # Equinox's `__getattribute__` costs a microsecond per access, and a fit reads a hundred fields
     __getattribute__ = object.__getattribute__
 
     def changed(self, **fields) -> "Experiment":
-        """Return this run with other fields, without repeated checks."""
+        """Return this run with some fields replaced, without checking it again."""
         found = object.__new__(type(self))
         vars(found).update(vars(self) | fields)
         return found

@@ -1,4 +1,4 @@
-"""Sensors and actuators of one run, with numbers in place of estimates: `Reading` and `Drive`."""
+"""Sensors and actuators of one run with numbers in place of estimates: `Reading` and `Drive`."""
 
 from collections.abc import Mapping
 
@@ -22,20 +22,20 @@ Numbers = Float[Entries, "..."]
 
 
 class Response(eqx.Module):
-    """The numbers of a sensor or actuator of one run, with first guesses for the estimated ones."""
+    """The numbers of a sensor or actuator of one run; estimated numbers have their first guesses."""
 
     numbers: dict[str, Numbers | float]
     unknown: Labels = static()  # names of estimated numbers
-    used: Labels = static()  # names of numbers with an effect
+    used: Labels = static()  # names of numbers that affect the reading or signal
 
     @property
     def is_late(self) -> bool:
-        """Return whether it has a delay or a lag."""
+        """Return whether the sensor or actuator has a delay or a lag."""
         return any(name in self.used for name in OF_TIME)
 
     @property
     def has_filter(self) -> bool:
-        """Return whether it has a low-pass filter."""
+        """Return whether the sensor or actuator has a low-pass filter."""
         return "lag" in self.used
 
     def scaled(self, x):
@@ -45,7 +45,7 @@ class Response(eqx.Module):
 
 
 class Reading(Response):
-    """A sensor of one run, with its quantity looked up."""
+    """A sensor of one run, with the quantity that it measures."""
 
     operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
     name: str = static()  # of the coordinate, speed or event
@@ -99,13 +99,13 @@ class Drive(Response):
         )
 
     def put_into(self, inputs) -> Inputs:
-        """Return `inputs` with this signal."""
+        """Return `inputs` with the signal of this actuator."""
         return eqx.tree_at(lambda i: i.channels[self.index], inputs, self.signal())
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
-    """Return the numbers of a sensor (first guesses of estimated numbers), the names of estimated numbers,
-    and the names of all numbers that have an effect.
+    """Return the numbers of a sensor or actuator (first guesses of estimated ones), the names of estimated
+    numbers, and the names of all numbers that have an effect.
     """
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))

@@ -18,8 +18,7 @@ _NO_INPUTS = Inputs(())
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
-    """Return the run with its inputs and sensors prepared, after checking channels and shapes against the
-    scene.
+    """Return the run with prepared inputs and sensors, after checking channels and shapes against the scene.
 
     `repeats`: whether values have a leading axis. Raises ValueError for an unknown channel, start value or
     input, for wrong shapes, and for samples that may refer to times before the start.
@@ -66,8 +65,8 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
-    """Return the quantity that a sensor measures (a prepared function, an instrument, or a name) and its
-    shape.
+    """Return the quantity that a sensor measures (a traced function, an instrument, or a name) and
+    its shape.
     """
     if isinstance(given, Instrument):
         given.check(scene, channel_name, where)
@@ -93,7 +92,7 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: Shape, esti
 
 
 def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
-    """Raise ValueError if a sample that counts may refer to a time before the start."""
+    """Raise ValueError if an available sample may refer to a time before the start."""
     delay, values = run.sensors[name].delay, run.values[name]
     if is_traced((delay, run.ts, run.t0, values, run.sigma[name])) or latest(delay) == 0:
         return
@@ -104,8 +103,8 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
             f"channel `{name}` of {where} starts at {first:g} s, with a delay of up to {latest(delay):g} s: "
-            f"its first samples are of times before t0 = {t0:g} s; give an earlier `t0` with its start, "
-            "or NaN for these samples"
+            f"its first samples refer to times before t0 = {t0:g} s; give an earlier `t0` and the start "
+            "then, or NaN for these samples"
         )
 
 
@@ -145,7 +144,7 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
 
 
 def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
-    """Raise ValueError if all samples of a varying input are before the run, or all after it."""
+    """Raise ValueError if all samples of a varying input lie before the run, or all after it."""
 
     def overlaps(knots, x, ts, t0):
         return np.ptp(x) == 0 or (knots[0] < ts[-1] and knots[-1] > t0)

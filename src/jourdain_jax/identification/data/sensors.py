@@ -1,4 +1,4 @@
-"""Sensors and actuators: models between a motion and its measurements, and between a command and the scene.
+"""Sensors and actuators: models of how measurements follow from a motion, and inputs from a command.
 
     sensor      reading(t) = gain y(t - delay) + bias,   lag y' + y = x,   y(t0) = x(t0)
     actuator    input(t) = gain y(t - delay) + bias,     lag y' + y = command
@@ -45,22 +45,22 @@ class Sensor(eqx.Module):
       instant) such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: the coordinate or
       speed with the channel's name.
     - `gain`, `bias` (in the unit of the channel): one number, or one per component of a vector channel.
-    - `delay` in s. Every sample that counts must come at least the largest delay after `t0`, since the
-      earlier motion is unknown.
+    - `delay` in s. Every sample must come at least the largest delay after `t0`, or be NaN, since the motion
+      before `t0` is unknown.
     - `lag` in s: time constant of a first-order low-pass filter, whose initial output is the quantity at
       `t0`.
 
     Each number may be an `Estimate`. By default an estimated lag is positive, and gain and bias are
     unbounded; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, the motion (with `shooting`, each piece of it) is computed at equal intervals.
-    There are at least 64, none longer than the median interval of the samples. The motion is interpolated by
-    polynomials of degree 5. For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of
-    the amplitude. Near a jump J of the slope, as of a speed under a force that steps, the error is up to 0.26
-    J h. Near a jump J of the second derivative, it is up to 0.08 J h^2.
+    With a delay or a lag, the motion (with `shooting`, each piece of it) is computed at 64 or more equal
+    intervals, none longer than the median interval of the samples, and interpolated by quintic polynomials.
+    For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude. Near a jump
+    J of the slope, such as that of a speed when a force jumps, the error is up to 0.26 J h. Near a jump J of
+    the second derivative, it is up to 0.08 J h^2.
 
-    Under `jit`, where times are unknown, the number of intervals is twice that of the samples: give a first
-    sample at or near `t0`.
+    Under `jit` times are unknown, and there are two intervals per sample: give a first sample at or near
+    `t0`.
 
     **Raises** ValueError for numbers that are not finite, and for negative delays or lags.
     """
@@ -106,8 +106,8 @@ class Actuator(eqx.Module):
       otherwise it is linear between samples. Holding doubles the number of samples, and a motion takes more
       steps.
 
-    The low-pass filter is exact at the samples of the command and linear in between. A held command therefore
-    needs a lag of at least one interval. The output ends with the last sample.
+    The output of the low-pass filter is exact at the samples of the command and linear in between. A held
+    command therefore needs a lag of at least one interval. The output ends with the last sample.
 
     **Raises** ValueError for a command or `hold` of another type, numbers that are not finite, and negative
     delays or lags.
@@ -183,5 +183,5 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
 
 
 def default_range(name: str):
-    """Return the default range of an estimated number."""
+    """Return the default range of an estimated number of a sensor or actuator."""
     return positive() if name == "lag" else unbounded()

@@ -1,4 +1,5 @@
-"""Unknowns at a bound: a one-sided limit by profile likelihood, and intervals that bounds make too narrow.
+"""One-sided limits of unknowns at a bound by profile likelihood, and detection of intervals that bounds make
+too narrow.
 
     p(delta) = min over all other unknowns of (F - F_min),   theta = bound + delta
     limit    2 p = 3.84 f;   f = 1 for known noise (see `standard_errors`)
@@ -6,13 +7,14 @@
     beyond   b / sqrt(w^2 - b^2 / n),   b = g e
 
 g: slope of F at the bound; 1 / h: variance of the unknown if it were free; e: its standard error, as
-predicted by F; b: standard errors from the bound to the free minimum beyond it. Where p < 0, F is lower away
-from the bound, a saddle. F is level at the bound if another unknown has the same effect: a delay at zero lag.
+predicted by F; b: standard errors from the bound to the free minimum beyond it. If p < 0, F is lower away
+from the bound. F has zero slope at the bound if another unknown has the same effect, as a delay has at zero
+lag.
 
-If sigmas are estimated, residuals caused by a bound count as noise: with N samples, b stays below sqrt(N)
-however far the bound is; `beyond` does not. The rise is the same as for other intervals. With the rise of a
-one-sided limit, 2.71 f, data would choose between two kinds of interval. Together these cover a true value
-1.6 standard errors from its bound in only 92.5 % of repeats.
+If sigmas are estimated, residuals caused by a bound count as noise. With N samples, b then stays below
+sqrt(N) however far away the bound is; `beyond` corrects this. The permitted rise of F is that of two-sided
+intervals. A one-sided rise of 2.71 f would let the data choose between two kinds of interval, which together
+would cover a true value 1.6 standard errors from its bound in only 92.5 % of repeats.
 
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins,
 Physical Review D 57 (1998) 3873, section IV.
@@ -41,15 +43,15 @@ class AtBounds:
     limit: ByUnknown  # infinite if the data give none
     beyond: ByUnknown  # distance of the free minimum beyond the bound, in standard errors
     if_free: Rise
-    # by member: F and all unknowns at a lower minimum with one unknown off its bound
+    # by member: F and all unknowns at a lower minimum, where one unknown is off its bound
     lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)
     # by member and unknown at a bound: all unknowns when that one is at its limit
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
-    """Return the statistics of unknowns at a bound: each is moved away from it, while all others are fitted
-    again.
+    """Return the statistics of unknowns at a bound. Each is moved away from its bound while all others are
+    fitted again.
     """
     theta, bound = found.theta, problem.unknowns.reached(found.theta)
     told = AtBounds(
@@ -86,8 +88,8 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
 def moved_from_bounds(
     told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]
 ) -> list[str]:
-    """Return one sentence for each unknown at a bound whose move to its limit takes other unknowns of the
-    first member out of their intervals (`reach`).
+    """Return one sentence for each unknown of the first member that is at a bound and whose move to its limit
+    takes other unknowns out of their intervals (`reach`).
     """
     sentences = []
     for (_, place), there in told.at_limit.items():
@@ -108,8 +110,8 @@ def moved_from_bounds(
 def too_narrow_near_bounds(
     problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]
 ) -> list[str]:
-    """Return sentences on intervals of the first member that are too narrow: the squares rise less than
-    predicted by `errors`, the standard errors of all free unknowns.
+    """Return sentences on intervals of the first member that are too narrow, because the sum of squares rises
+    less than `errors`, the standard errors of all free unknowns, predict.
 
     The ends of intervals of shared unknowns are tested if an interval reaches a bound, or if an unknown may
     leave its bound.
@@ -139,7 +141,7 @@ def too_narrow_near_bounds(
 
     sentences = []
     if names := named(range(len(labels)), to_bounds):
-        why = "and others may be: up to a nearby bound, the squares rise less than standard errors predict"
+        why = "and others may be: up to a nearby bound, squares rise less than the standard errors predict"
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [
@@ -149,8 +151,8 @@ def too_narrow_near_bounds(
     ]
     if names := named(shared[:8], to_ends):
         sentences.append(
-            f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to "
-            f"the ends than standard errors predict; {ADVICE}"
+            f"{_too_narrow(names)}: if {bounded} may leave the bound, squares rise less towards the ends "
+            f"than the standard errors predict; {ADVICE}"
         )
     return sentences
 

@@ -1,5 +1,5 @@
-"""Correlated noise: an Ornstein-Uhlenbeck process in each channel, which is an AR(1) process at equal
-intervals.
+"""Correlated noise: an Ornstein-Uhlenbeck process in each channel. At equal intervals this is an AR(1)
+process.
 
     E e(t) e(t') = sigma^2 exp(-|t - t'| / tau)
     rho_k = exp(-(t_k - t_j) / tau)
@@ -29,7 +29,7 @@ from jourdain_jax.calculus.reals import Entries
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.solve.arrow import Arrow, PerMember, eliminated
 
-SHORTEST = 0.1  # in shortest intervals: below this tau, the noise is white
+SHORTEST = 0.1  # shortest tau, in shortest intervals: below it the noise is white
 
 
 def chain(
@@ -61,8 +61,8 @@ def whitened(r, previous, rho):
 
 @dataclass(frozen=True)
 class Chains:
-    """For each sample among the residuals, the index of the previous sample. There is one set for each member
-    of a group of equally structured runs.
+    """The index of the previous sample for each sample among the residuals, separately for each member of a
+    group of equally structured runs.
     """
 
     before: Int[np.ndarray, "runs members samples"]
@@ -153,7 +153,7 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
             "a correlation time is None, but each run has only one sample, which cannot "
             "determine it; give a number in s, or 0 for white noise"
         )
-    # beyond ten spans it is hardly distinguishable from a bias
+    # a correlation time beyond ten spans is hardly distinguishable from a bias
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 

@@ -9,11 +9,11 @@
                       x <- x + K r,   P <- (1 - K H) P (1 - K H)' + K R K'
     log L             - sum (r' S^-1 r + log det S + n log 2 pi) / 2
 
-P: covariance of x; R: of the n readings; h: interval between two samples, with nodes s_j and weights w_j of
-Gauss and Legendre. Dependent coordinates and speeds follow
-from the constraints. The result is exact for linear scenes; otherwise it is of first order in the spread of
-x. Source: A. H. Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.3; G. J. Bierman,
-Factorization Methods for Discrete Sequential Estimation (1977), section II.6 (Joseph's form of P).
+P: covariance of x; R: covariance of the n readings; h: interval between two samples, with Gauss-Legendre
+nodes s_j and weights w_j. Dependent coordinates and speeds follow from the constraints. The result is exact
+for linear scenes; otherwise it is of first order in the spread of x. Source: A. H. Jazwinski, Stochastic
+Processes and Filtering Theory (1970), section 8.3; G. J. Bierman, Factorization Methods for Discrete
+Sequential Estimation (1977), section II.6 (Joseph's form of P).
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,21 +64,21 @@ def filtered_log_likelihood(
 
     **Arguments**
 
-    - `data`: one run or several. A start value is known, or a first guess with an
-      `Estimate(prior=Normal(mean, sigma))` in `unknown_start`, its distribution at the start. Sensors have no
-      delay and no lag, and all their numbers are known.
+    - `data`: one run or several. Each start value is known, or has an `Estimate(prior=Normal(mean, sigma))`
+      in `unknown_start`, its distribution at the start. Sensors must have no delay and no lag, and only known
+      numbers.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the
-      speed)^2 / s. In the time t, the disturbance adds q t to the variance of the speed. Speeds without an
-      entry are not disturbed. The independent speeds are `scene.privileged`, or the engine's choice.
+      speed)^2 / s: in a time t, it adds q t to the variance of the speed. Speeds without an entry are not
+      disturbed. The independent speeds are `scene.privileged`, or the engine's choice.
     - `options`, `by_name`: as in `simulate`.
 
     The motion between samples and its derivatives with respect to the state come from `simulate`. The
     likelihood is exact for linear scenes; for others the covariance of the state is propagated to first
     order. Without process noise and with a known start it equals `log_likelihood`.
 
-    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode
-    (`jax.jacfwd`), under `jit` and `vmap`. The result is -inf if the motion fails. Make sensors outside of
-    `jit`: inside, their delay is traced.
+    The result is differentiable with respect to parameters, start values, sigmas and intensities in forward
+    mode (`jax.jacfwd`), also under `jit` and `vmap`. It is -inf if the motion fails. Make sensors outside of
+    `jit`, since a traced delay cannot be checked.
 
     **Raises** ValueError for a name that is no independent speed, intensities below zero, quaternions,
     sensors with a delay or lag, accelerometers, noise with a correlation time, and unknown numbers.
@@ -159,8 +159,8 @@ class _Filter:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
 
     def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
-        """Return the state with these independent coordinates and speeds; the others follow, with coordinates
-        near q.
+        """Return the state with these independent coordinates and speeds. The others follow from the
+        constraints, with coordinates near q.
         """
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
@@ -187,7 +187,7 @@ class _Filter:
         return tuple(jnp.where(moves, new, old) for new, old in ((q1, q), (x1, x), (F @ P @ F.T + added, P)))
 
     def _updated(self, t, q, x, P, values, weights):
-        """Return x and P after the samples at one time, and the logarithm of their density; samples with zero
+        """Return x and P after the samples at one time, and the logarithm of their density. Samples of zero
         weight are missing.
         """
 
@@ -262,8 +262,8 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
 
 
 def _independent_speeds(scene: Scene, run: Experiment) -> Indices:
-    """Return the scene's independent speeds. If they do not determine the rest at a known start, return the
-    independent speeds chosen for that start.
+    """Return the scene's independent speeds. If these do not determine the other speeds at a known start,
+    return independent speeds chosen for that start.
     """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)

@@ -22,7 +22,7 @@ _REFUSED["retry"] = "it computes each motion by one compiled method"
 def as_fit_options(
     scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str
 ) -> AllOptions:
-    """Return the options of the motions of a fit, or of a likelihood."""
+    """Return the options of the motions of a fit or a likelihood."""
     found = as_options(options, by_name, function, _REFUSED, scene)
     return replace(found, work=False, retry=False)
 
@@ -47,8 +47,8 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], Labels]) -> Labels:
-    """Return the channels with None in place of a value, which is estimated. Raises ValueError for a channel
-    with None in one run and a value in another.
+    """Return the channels whose value is None and therefore estimated. Raises ValueError for a channel with
+    None in one run and a value in another.
     """
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:

@@ -1,24 +1,24 @@
 """Information of measurements about the unknowns: covariance, and undetermined combinations.
 
     J_s = d r / d (theta / size)    an arrow of own unknowns x_i and shared ones s; r in units of sigma
-    own        U S V' of a run's own columns; directions V_0 with S <= cutoff (the largest) are undetermined
+    own        U S V' of a run's own columns; directions V_0 with S <= cutoff max(S) are undetermined
     shared     U S V' of the columns of s after projecting out those of all x_i
-    rank       number of singular values above cutoff (the largest)
+    rank       number of singular values above cutoff max(S)
     covariance of s          size V_1 S_1^-2 V_1' size                    over the determined directions V_1
                of x_i, x_j   delta_ij (T_i' T_i)^+ + G_i cov(s) G_j',     x_i = - G_i s for fitted own columns
 
-An unknown with a part in the remaining directions V_0 has no standard error and no interval. It has a part if
-it changes by sqrt(cutoff) of its size, or by a tenth of its standard error, when all unknowns change along
-V_0 by about their sizes. Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and
-3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
+An unknown that takes part in the undetermined directions V_0 has no standard error and no interval. It takes
+part if it changes by sqrt(cutoff) of its size, or by a tenth of its standard error, when all unknowns change
+along V_0 by about their sizes. Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections
+2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 
 Numbers that depend on the estimates of a fit have estimates, standard errors and intervals to first order:
 
     y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))
 
-C: covariance of the estimates; q: quantile. A number can be determined although its parts are not: it has a
-standard error if g has no part in undetermined directions. Source: C. R. Rao, Linear Statistical Inference
-and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
+C: covariance of the estimates; q: quantile. Such a number may be determined although the unknowns in it are
+not: it has a standard error if g vanishes along undetermined directions. Source: C. R. Rao, Linear
+Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
 
 Poorly determined combinations of unknowns ("sloppy" directions):
 
@@ -46,21 +46,21 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Covariance in blocks, and undetermined directions, as changes of theta divided by the sizes of its
-    entries. In a batch of fits all arrays have a leading axis `members`.
+    """Covariance in blocks, and undetermined directions, given as changes of theta divided by the sizes of
+    its entries. In a batch of fits all arrays have a leading axis `members`.
     """
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
     hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # undetermined directions of each member, orthonormal
-    # change of theta / size along such a direction above which an unknown has a part in it
+    # an unknown takes part in such a direction if theta / size changes by more than this along it
     least_part: Float[np.ndarray, "*members unknowns"]
     rank: Int[np.ndarray, "*members"]  # number of determined directions
     identifiable: Bool[np.ndarray, "*members unknowns"]
     standard_errors: Float[np.ndarray, "*members unknowns"]  # NaN if not identifiable
     shared: Float[np.ndarray, "*members shared shared"]
-    own: Float[np.ndarray, "*members runs own own"]  # covariance for known shared unknowns
+    own: Float[np.ndarray, "*members runs own own"]  # covariance if the shared unknowns are known
     follow: Float[np.ndarray, "*members runs own shared"]  # G
-    estimated: Int[np.ndarray, "unknowns"]  # their indices among the unknowns of all runs
+    estimated: Int[np.ndarray, "unknowns"]  # indices of the unknowns among the places of all runs
 
     @property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
@@ -174,20 +174,20 @@ def information(
 
 
 def least_move(cutoff: float, largest):
-    """Return the movement, in standard errors, below which an unknown does not count as part of an
-    undetermined direction.
+    """Return the change, in standard errors, below which an unknown does not take part in an undetermined
+    direction.
 
     An error of cutoff * (largest singular value) in J rotates such a direction by this many standard errors.
     """
-    # standard errors: an unknown that moves this far along an undetermined direction has a part in it
+    # standard errors: an unknown that moves this far along an undetermined direction takes part in it
     return np.maximum(0.1, cutoff * largest)
 
 
 def _hidden_directions(
     own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray
 ) -> np.ndarray:
-    """Return orthonormal undetermined directions that leave held unknowns unchanged. `own`: V' of each run,
-    possibly with determined directions.
+    """Return orthonormal undetermined directions along which held unknowns do not change. `own`: V' of each
+    run, possibly with determined directions.
     """
     (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
     apart = np.zeros((len(runs), count, m))
@@ -201,11 +201,11 @@ def _hidden_directions(
 
 
 def hidden_combinations(directions, least_part, size, values, labels: Labels) -> Sentences:
-    """Return a sentence on each undetermined direction. `directions`: orthonormal rows, each with changes of
-    theta divided by the sizes of its entries; parts below `least_part` count as zero.
+    """Return a sentence on each undetermined direction. `directions`: orthonormal rows of changes of theta,
+    divided by the sizes of its entries; changes below `least_part` count as zero.
 
-    The basis is chosen (row-reduced form) so that each direction has one unknown of its own. Changes are
-    relative, `d theta / theta`, for nonzero unknowns.
+    In the chosen basis (row-reduced form), each direction contains one unknown that no other direction
+    contains. Changes are relative, `d theta / theta`, for nonzero unknowns.
     """
     relative = np.abs(values) > 1e-3 * np.abs(size)
     basis = _reduced(np.asarray(directions), least_part) * size / np.where(relative, values, 1.0)
@@ -235,18 +235,18 @@ def _in_words(
     if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < close):
         of_own = ["" if abs(e - 1) < close else f"^{e:.3g}" for e in exponents]
         return (
-            f"{text}; determined is only "
+            f"{text}; the data determine only "
             f"{', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
         )
     moved = np.where(relative, row * values, row)[involved]
     if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < close * abs(moved[0]):
-        return f"{text}; determined is only their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
+        return f"{text}; the data determine only their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
     return text
 
 
 def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
-    """Return the reduced row-echelon form with the largest pivots. Parts below `least_part`, in rows of unit
-    length, are noise and become zero.
+    """Return the reduced row-echelon form, computed with the largest pivots. Entries below `least_part` of
+    rows of unit length are noise and become zero.
     """
     rows, free = rows.copy(), list(range(len(rows)))
     for _ in range(len(rows)):
@@ -298,7 +298,7 @@ def standard_errors(
     """Return standard errors of numbers with these derivatives. Derivatives and results have a leading axis
     of repeats if the information has one.
 
-    They are NaN for numbers that depend on an undetermined direction or on an unknown at a bound.
+    The result is NaN for a number that depends on an undetermined direction or on an unknown at a bound.
     """
     shared = slopes.shape[-1]
     parts = (
@@ -331,9 +331,8 @@ def weak_combinations(
     sizes: Float[np.ndarray, "unknowns"],
     labels: Labels,
 ) -> Labels:
-    """Return the directions with a relative standard error of at least 0.1, weakest first, one sentence each.
-
-    They concern the shared unknowns, if there are any.
+    """Return directions with a relative standard error of at least 0.1, weakest first, one sentence each.
+    Only shared unknowns are examined, if there are any.
     """
     some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # examined unknowns
     shared = [i for i in some if not labels[i].startswith("run ")]

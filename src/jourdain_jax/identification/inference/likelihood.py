@@ -30,10 +30,10 @@ def log_likelihood(
     """Return the logarithm of the probability density of the measurements `data` (one run or several): `- sum
     r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
-    Differentiable in scene, start values, measured values, sigmas, numbers of sensors and actuators (reverse
-    mode, unless `adjoint` requests another) and known correlation times of the noise. It is -inf if the
-    motion fails. `options`, `by_name`: as in `simulate`. Missing samples (NaN, or an infinite sigma) do not
-    count.
+    The result is differentiable with respect to the scene, start values, measured values, sigmas, numbers of
+    sensors and actuators (reverse mode, unless `adjoint` requests another) and known correlation times of the
+    noise. It is -inf if the motion fails. Missing samples (NaN, or an infinite sigma) are omitted. `options`,
+    `by_name`: as in `simulate`.
 
         jax.grad(lambda a: jj.identification.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 

@@ -1,12 +1,12 @@
-"""The posterior density of the unknowns of a fit, as a function of any real numbers, for samplers.
+"""The posterior density of the unknowns of a fit as a function of unbounded real numbers, for samplers.
 
     log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|
     theta = constrain(x),   x = centre + F z
 
-L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from
-a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the shortest
-interval, with a uniform prior (Jeffreys' prior of AR(1) noise). Source: A. Gelman et al., Bayesian Data
-Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
+L: `log_likelihood`; x: one real number for each unknown (`Range`). centre and F are zero and the identity, or
+come from a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the
+shortest interval, with a uniform prior (Jeffreys' prior of AR(1) noise). Source: A. Gelman et al., Bayesian
+Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -46,8 +46,8 @@ Points = Float[Array, "*batch unknowns"]
 
 
 class LogDensity(eqx.Module):
-    """`log p(z)` of a vector z of real numbers, up to a constant. It can be called under `jit`, `grad` and
-    `vmap`.
+    """The function `log p(z)` of a vector z of real numbers, up to a constant. It can be called under `jit`,
+    `grad` and `vmap`.
 
     `labels` names the unknowns, as in a `Fit`; an estimated sigma is `"lean.sigma"`, a correlation time
     `"lean.correlation_time"` (s).
@@ -133,7 +133,7 @@ class LogDensity(eqx.Module):
         return {label: theta[..., i] for i, label in enumerate(self.labels)}
 
     def unconstrain(self, values: Mapping) -> Point:
-        """Return z for these values of unknowns by name, in their units. Omitted unknowns are at their first
+        """Return z for these values of unknowns by name, in their units. Omitted unknowns have their first
         guess.
 
         Raises ValueError for names that are not in `labels`, and for values at or beyond a bound.
@@ -159,8 +159,8 @@ class LogDensity(eqx.Module):
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
     def whitened(self, fit: Estimates) -> "LogDensity":
-        """Return the density of numbers z that are independent with unit variance, according to a fit of the
-        same data. Samplers then need few steps.
+        """Return the density as a function of another vector z, whose entries are independent with unit
+        variance according to a fit of the same data. Samplers then need few steps.
 
         `constrain` and `named` convert back to the unknowns. At the minimum of the fit z is zero. Raises
         ValueError for a fit of other unknowns, for a batch, and for unknowns without a standard error
@@ -235,7 +235,7 @@ class LogDensity(eqx.Module):
         return self.centre + z @ self.factor.T
 
     def _each(self, of: Callable, x: Points) -> Points:
-        """Apply the method `of` of the range of each unknown to its number in `x`."""
+        """Apply the method `of` of each unknown's range to its number in `x`."""
         return jnp.stack([of(one, x[..., i]) for i, one in enumerate(self.ranges)], axis=-1)
 
     def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
@@ -270,13 +270,12 @@ def log_density(
       values, estimated numbers of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
     - Priors: `Normal` if an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
       itself, and in the logarithm of a sigma. For a correlation time tau it is flat in arcsin(exp(-h / tau)),
-      where h is the shortest interval between samples of the channel. A flat prior without bounds has no
-      integral: if the data do not determine an unknown, the posterior has no integral either, and a sampler
-      diverges.
+      where h is the shortest interval between samples of the channel. A flat prior without bounds cannot be
+      normalised: if the data do not determine the unknown, neither can the posterior, and a sampler diverges.
 
     **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain`
-    convert between the vector and the unknowns. It includes the logarithms of the transforms' derivatives. It
-    is a pure function: it works under `jit`, `vmap` and `grad`.
+    convert between the vector and the unknowns. The density includes the logarithms of the transforms'
+    derivatives. It is a pure function, for `jit`, `vmap` and `grad`.
 
     **Raises** ValueError as in `fit`.
 

@@ -5,7 +5,8 @@
     variance of the estimate     C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2
 
 C: covariance of all unknowns; w, J_c: the n_c residuals of channel c and their derivatives; v_ic:
-contribution of channel c to the variance C_ii. The last line includes that weights are estimated, too.
+contribution of channel c to the variance C_ii. The last line accounts for the weights, which are estimated,
+too.
 
 With one channel and no prior there are n - p degrees of freedom, and intervals are those of Student's t.
 Under a robust loss the same holds for all samples together, with the inflation of the variance in place of
@@ -30,13 +31,13 @@ from jourdain_jax.identification.solve.problem import Problem
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """A linearised problem with these sigmas, and their statistics."""
+    """A linearised problem with estimated sigmas, and the statistics of these."""
 
     at: Linearised
     known: Information
     doubt: ByUnknown  # variance of log C_ii: 2 over its degrees of freedom
     more: ByUnknown  # contribution of estimated weights to C_ii, relative to it
-    # channels that do not determine their sigma, and are not used
+    # channels that do not determine their sigma; their samples are not used
     untold: Bool[np.ndarray, "members channels"]
 
 
@@ -47,9 +48,9 @@ def noise_levels(
     told_by: Callable,
     of_loss: Callable[[np.ndarray, float], float],
 ) -> NoiseLevels:
-    """Return sigmas and their statistics at theta. `told_by` returns the information of an arrow matrix.
-    `of_loss` returns the inflation of variances by a loss; its arguments are the residuals of one member and
-    the number of unknowns that they determined.
+    """Return sigmas and their statistics at theta. `told_by(arrow)` returns the information of an arrow
+    matrix. `of_loss(residuals, unknowns)` returns the inflation of variances by a loss, for the residuals of
+    one member and the number of unknowns that they determined.
     """
     members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
     known = told_by(at.arrow)
@@ -89,7 +90,7 @@ def noise_levels(
         np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], fewest)[..., None], axis=1
     )
     at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
-    more, change = 0 * doubt, 0.03  # of sigma^2: increment for the second derivative of C
+    more, change = 0 * doubt, 0.03  # relative increment of sigma^2, for the second derivative of C
     for k in range(1, count):
         other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-change, change)]
         ends = [

@@ -3,8 +3,8 @@
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior
     cov(theta) >= F^-1      (Cramer and Rao)
 
-y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. For some of the unknowns, log
-det F follows from their block of F^-1: all others are estimated as well. Source: A. C. Atkinson, A. N. Donev
+y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. For some of the unknowns, with
+all others estimated as well, log det F follows from their block of F^-1. Source: A. C. Atkinson, A. N. Donev
 and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
@@ -44,8 +44,8 @@ class PlannedInformation(Printed, eqx.Module):
     """The information of planned runs about each unknown. `print` shows the expected standard errors."""
 
     matrix: Matrix  # F, in the units of the unknowns
-    values: Float[Entries, "unknowns"]  # at which it is evaluated
-    # of each run and channel: (d y / d theta) / sigma, zero for missing samples
+    values: Float[Entries, "unknowns"]  # of the unknowns, at which F is evaluated
+    # (d y / d theta) / sigma for each run and channel; zero for missing samples
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]
     labels: Labels = static()
     units: Labels = static()
@@ -78,7 +78,7 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def _hidden(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return undetermined directions, as rows, and the sizes that scale the unknowns."""
+        """Return undetermined directions as rows, and the sizes by which the unknowns are scaled."""
         values = np.abs(np.asarray(self.values))
         size = np.where(values > 0, values, 1.0)
         squares, directions = np.linalg.eigh(np.asarray(self.matrix) * size * size[:, None])
@@ -103,7 +103,7 @@ def _inverse(F: Matrix) -> Matrix:
 
 @compiled
 def _log_det(F: Matrix, places: Indices) -> Scalar:
-    """Return the log-determinant of this block of the inverse."""
+    """Return the log-determinant of the block `places` of the inverse of F."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
@@ -125,11 +125,11 @@ def planned_information(
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and
       sensors. Their `values` have no effect; NaN marks a missing sample.
     - `free`, `options`, `by_name`: as in `fit`. Start values in `unknown_start` and estimated numbers of
-      sensors are unknowns, too, and priors count.
+      sensors are unknowns, too. Priors are included.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with
-    respect to parameters, start values and samples of inputs, in forward mode (`jax.jacfwd`) and under `jit`:
-    starts and inputs can be optimised. Derivatives with respect to samples use XLA.
+    respect to parameters, start values and samples of inputs in forward mode (`jax.jacfwd`), also under
+    `jit`, so that starts and inputs can be optimised. Derivatives with respect to samples use XLA.
 
     **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and
     correlated noise.

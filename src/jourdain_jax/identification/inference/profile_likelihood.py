@@ -1,4 +1,6 @@
-"""The profile likelihood of one unknown: the least F over all other unknowns, as a function of this one."""
+"""The profile likelihood of one unknown: the minimum of F over all other unknowns, as a function of
+this one.
+"""
 
 from typing import NamedTuple
 
@@ -9,9 +11,9 @@ from jourdain_jax.identification.solve.problem import Problem
 
 
 class Side(NamedTuple):
-    """The profile of one unknown to one side of its estimate."""
+    """The profile of one unknown on one side of its estimate."""
 
-    end: float  # value at the permitted rise of F; if F does not rise so far, the bound or infinity
+    end: float  # value at the permitted rise of F; the bound or infinity if F does not rise so far
     is_closed: bool  # whether F reaches the permitted rise
     at: Minimum | None  # the minimum at the end, or a minimum lower than the fit's
     points: list[tuple[float, float]]  # values of the unknown, and rises of F
@@ -19,11 +21,11 @@ class Side(NamedTuple):
 
 
 def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
-    """Follow the profile of member `b` along one unknown in one direction (`way` is 1 or -1), starting at the
-    distance `first`, until F has risen by `end`.
+    """Follow the profile of member `b` along one unknown in the direction `way` (1 or -1), starting at the
+    distance `first` from the estimate, until F has risen by `end`.
 
-    All other unknowns start from their values at the previous point. The end is found by the secant method
-    for the square root of the rise, which is nearly linear.
+    Each fit of the other unknowns starts from the previous point. The end is found by the secant method for
+    the square root of the rise, which is nearly linear.
     """
     close, origin, theta = (
         0.01,

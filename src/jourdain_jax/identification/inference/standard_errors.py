@@ -1,4 +1,4 @@
-"""Uncertainty of estimates at a minimum: from given or estimated sigmas, unknown correlation times, or
+"""Uncertainty of estimates at a minimum, from given or estimated sigmas, estimated correlation times, or
 differences between runs.
 
     interval     estimate -+ q e
@@ -9,7 +9,7 @@ noise is estimated, times the root of the contribution of estimated correlation 
 w: e over the standard error that F alone predicts. F estimates sigma from all samples, without allowing for
 the unknowns.
 
-With one channel of unknown sigma, no prior and a linear motion, both are the interval of Student's t of
+With one channel of unknown sigma, no prior and a linear motion, both equal the Student's t interval of linear
 regression. Source: F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; D. M. Bates and D. G. Watts,
 Nonlinear Regression Analysis (1988), section 6.1.
 """
@@ -43,14 +43,14 @@ class Rise:
 class Spread:
     """Uncertainties of the estimates, of all members."""
 
-    levels: NoiseLevels  # sigmas, and the information with them
-    known: Information  # the same, or by differences between runs
+    levels: NoiseLevels  # sigmas, and the information that follows from them
+    known: Information  # the same information, or that from differences between runs
     quantiles: ByUnknown  # q
     rise: Rise
 
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
-    """Return the uncertainties of estimates; unknowns at a `bound` are held there."""
+    """Return the uncertainties of estimates. Unknowns at a `bound` are held there."""
     unknowns = problem.unknowns
     theta = found.theta
     scores = found.at.arrow.scores
@@ -86,7 +86,9 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
 
 
 def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Rise:
-    """Return the statistics of each unknown at a `bound` as if it were free; NaN for others."""
+    """Return the statistics that each unknown at a `bound` would have if it were free; NaN for other
+    unknowns.
+    """
     told = np.full((4, *bound.shape), np.nan)
     for place in np.flatnonzero(bound.any(axis=0)).tolist():
         others = np.where(np.arange(bound.shape[1]) == place, False, bound)

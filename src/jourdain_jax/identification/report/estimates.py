@@ -30,7 +30,9 @@ Marks = Bool[np.ndarray, "*repeats"]
 
 
 class Estimated(Printed, eqx.Module):
-    """One unknown, in its unit; NaN if the measurements do not determine it."""
+    """The estimate of one unknown, in its unit, with standard error and interval; NaN if the measurements do
+    not determine it.
+    """
 
     value: PerRepeat
     standard_error: PerRepeat
@@ -93,12 +95,12 @@ class Estimates(Printed):
     # distance of the free optimum beyond the bound, in standard errors; NaN for estimates off a bound
     beyond: PerUnknown
     converged: Marks
-    stuck: Marks  # no step lowers the sum of squares, but this is no minimum
+    stuck: Marks  # no step lowers the sum of squares, but the point is no minimum
     steps: Counts  # number of tried steps
     grown: Marks  # whether growing spans found the minimum, far from the result of the first guess
     agreeing: Counts  # number of first guesses that led to this minimum; zero for a batch
     shooting: Shot | None  # results of multiple shooting
-    # objective, and F initially and after each tried step; empty for a batch
+    # name of the objective, and F initially and after each tried step; empty for a batch
     trace: tuple[tuple[str, tuple[float, ...]], ...]
     asked: Asked  # arguments of `fit`, among them `guesses` and `errors`
     unknowns: Unknowns  # with `labels`, `units` and `layout`
@@ -110,12 +112,12 @@ class Estimates(Printed):
         return self.work_out()
 
     def __getstate__(self) -> dict:
-        # compiled programs stay in their process
+        # compiled programs cannot leave their process
         return vars(self) | {"statistics": self.statistics, "work_out": None}
 
     def __getattr__(self, name: str) -> Any:
-        """Return an entry of `statistics` (such as `standard_errors`), of the arguments of the fit, or of the
-        unknowns.
+        """Return an attribute of `statistics` (such as `standard_errors`), of the arguments of the fit, or of
+        the unknowns.
         """
         parts = {
             "statistics": Statistics.__dataclass_fields__,
@@ -157,8 +159,8 @@ class Estimates(Printed):
 
     @property
     def reduced_chi_square(self) -> PerRepeat:
-        """Return the sum of squared residuals per degree of freedom. It is near 1 for a correct scene and
-        correct sigmas, and NaN without degrees of freedom.
+        """Return the sum of squared residuals per degree of freedom: near 1 for a correct scene and correct
+        sigmas, NaN without degrees of freedom.
         """
         return np.asarray(
             self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan)
@@ -169,7 +171,7 @@ class Estimates(Printed):
 
     @property
     def agreement(self) -> str:
-        """Return a text with the number of first guesses that led to the minimum."""
+        """Return a sentence with the number of first guesses that led to the minimum."""
         return (
             f"{int(self.agreeing) or 'none'} of {self.guesses} first guesses led to"
             f" {'this' if self.agreeing else 'a'} minimum"
@@ -245,9 +247,9 @@ class Estimates(Printed):
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
         With y = f(scene), var(y) = g' C g to first order (the delta method), where g = d y / d theta and C is
-        the covariance of the estimates. A combination may have an interval even if its parts are not
-        identifiable separately. The result is NaN if it depends on an undetermined direction, or on an
-        unknown at its bound.
+        the covariance of the estimates. A combination of unknowns may have an interval even if the unknowns
+        are not identifiable separately. The result is NaN if it depends on an undetermined direction, or on
+        an unknown at its bound.
 
         - `function`: plain JAX, of a scene; returns an array of any shape. `unit`: of the result, for
           `print`.
@@ -268,8 +270,8 @@ class Estimates(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """Return the parameters that depend on unknowns through a function or a possible inertia in `free`,
-        in the form of `derived`.
+        """Return estimates, as by `derived`, of the parameters that depend on unknowns through a function or
+        a possible inertia in `free`.
         """
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {

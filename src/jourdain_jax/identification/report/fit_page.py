@@ -1,8 +1,8 @@
 """A fit as one self-contained HTML file: texts, tables and figures.
 
-If AR(1) noise of correlation r_1 is assumed white, intervals are too narrow by about sqrt((1 + r_1) / (1 -
-r_1)), for slowly changing sensitivities: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series Analysis,
-3rd ed. (1994), section 2.1.5.
+If AR(1) noise of correlation r_1 is taken for white noise, intervals are too narrow by about sqrt((1 + r_1) /
+(1 - r_1)) for slowly changing sensitivities: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series
+Analysis, 3rd ed. (1994), section 2.1.5.
 
 Figures: data and prediction with errors, the interval of each unknown, and its profile.
 """
@@ -23,8 +23,8 @@ _WIDTH, _HEIGHT = 460, 200  # pixels
 
 
 def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:
-    """Draw samples of one component with their prediction, and below them the errors in sigmas over a band of
-    two sigmas.
+    """Draw samples of one component with their prediction, and below them the errors in sigmas, with a band
+    of two sigmas.
     """
     value, predicted, sigma = (
         np.asarray(x).reshape(len(one.ts), -1)[:, component] for x in (one.values, one.prediction, one.sigma)
@@ -48,7 +48,7 @@ def interval_widths(fit: Estimates) -> str:
     """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on a logarithmic
     axis.
     """
-    names, narrowest, widest = fit.labels[:40], 1e-4, 100.0  # unknowns in one figure; per cent
+    names, narrowest, widest = fit.labels[:40], 1e-4, 100.0  # drawn unknowns; limits in per cent
     values, low, high = (np.asarray(x[: len(names)], float) for x in (fit.values, fit.low, fit.high))
     half = np.maximum(high - values, values - low)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""The result of a fit, `Fit`: estimates, the reasons to doubt them, profiles, predictions and the page."""
+"""The result of a fit, `Fit`: estimates, warnings, profiles, predictions and the report."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -29,7 +29,7 @@ class Fit(Estimates):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene;
     `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, also the arrays of `scene`; the following
+    After `fit_batch`, every array, including those of `scene`, has a leading axis `repeats`; the following
     describes one fit.
     """
 
@@ -44,9 +44,9 @@ class Fit(Estimates):
         return warnings_of(self)
 
     def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
-        """Return the profile likelihoods of the unknowns in `names` (default: all shared ones), by name. Each
-        gives the range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted again,
-        and whether it is "bounded", "one-sided" or "flat". `data`: the runs of the fit.
+        """Return the profile likelihoods of the unknowns in `names` (default: all shared ones), by name. A
+        profile has the range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted
+        again, and its kind: "bounded", "one-sided" or "flat". `data`: the runs of the fit.
 
         This takes some ten fits per name. For estimated sigmas, a robust loss or errors="runs", the rise is
         scaled accordingly. Raises ValueError for a batch, a failed fit, and other data than the fit's;
@@ -62,8 +62,8 @@ class Fit(Estimates):
         return profiles(*fitted, as_names(names) or of_all, errors, of_rise)
 
     def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
-        """Return predictions of `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the
-        unit of the channel) and `r_squared`.
+        """Return predictions for `runs` that were not fitted: for each run a dictionary by channel with
+        `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
         Shared unknowns keep their estimates; unknown start values, and the numbers of each run's sensors, are
         fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit the
@@ -89,9 +89,9 @@ class Fit(Estimates):
           the information on each unknown. The share of sample k is a_k^2 / sum a^2, with a = C J', the
           covariance C and the derivatives J.
         - `held_out`: other runs, predicted as by `predict`.
-        - `profiles`: True or names, to compute them now; or the result of `profiles`.
-        - `units`: channel -> unit, for labels, such as `{"x": "m"}`, since a scene states units only of
-          parameters.
+        - `profiles`: True or names of unknowns, to compute their profiles now; or the result of
+          `Fit.profiles`.
+        - `units`: channel -> unit, for labels, such as `{"x": "m"}`; a scene has units only for parameters.
 
         Raises ValueError for a path that is no .html file, a batch or a failed fit, and other data than the
         fit's.

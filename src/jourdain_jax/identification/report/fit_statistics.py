@@ -36,20 +36,20 @@ PerUnknown = Float[np.ndarray, "*repeats unknowns"]
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics of a minimum, apart from its position."""
+    """Statistics of a minimum."""
 
     scene: Scene  # with the estimates
     starts: tuple[dict[str, Float[Entries, "..."]], ...]  # initial values of each run, with the estimates
-    sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
+    sizes: PerUnknown  # magnitudes of the unknowns, which scale the Jacobian for its rank
     standard_errors: PerUnknown  # NaN if not identifiable
     low: PerUnknown  # ends of the 95 % intervals; NaN if not identifiable
     high: PerUnknown
-    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # without a standard error, with a one-sided interval
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # they have a one-sided interval, no standard error
     quantiles: PerUnknown  # q
     information: Information  # covariance in blocks, and undetermined directions
-    # of each run by channel: (prediction - value) / sigma; NaN if missing
+    # (prediction - value) / sigma of each run by channel; NaN if missing
     residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
-    # residuals minus their prediction from the previous sample, if noise is correlated
+    # residuals; for correlated noise, minus their prediction from the previous sample
     whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
     sigma: dict[str, PerRepeat]  # of channels with estimated noise
     correlation_time: dict[str, PerRepeat]  # s, of channels with an estimate; near zero: white
@@ -58,14 +58,15 @@ class Statistics:
     samples: Counts  # with a finite sigma
     degrees_of_freedom: PerRepeat  # samples minus the directions that they determine; priors reduce these
     of_rise: PerUnknown  # divisor of 2 (F - F_min), for an interval that ends where it is `RISE_95`
-    from_prior: PerUnknown  # in standard deviations of the prior; zero if there is none
-    oddities: Sentences  # sentences about oddities of the runs
-    # sentences about events before the end of a run, or missed; empty for a batch or multiple shooting
+    from_prior: PerUnknown  # distance in standard deviations of the prior; zero without a prior
+    oddities: Sentences  # sentences about probable mistakes in the data
+    # sentences about events before the end of a run, and missed events; empty for a batch or multiple
+    # shooting
     events_met: Sentences
     too_narrow: Sentences  # sentences about intervals that bounds make too narrow; empty for a batch
 
 
-@np.errstate(over="ignore", invalid="ignore")  # for unknowns without bounds that grew enormously
+@np.errstate(over="ignore", invalid="ignore")  # unbounded unknowns may be enormous
 def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
     """Return the statistics of the minimum."""
     unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one

@@ -31,7 +31,7 @@ def warnings_of(fit: Estimates) -> Sentences:
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
-    """Yield warnings if there is no true minimum, or if bounds or missing degrees of freedom determine it."""
+    """Yield warnings if no minimum was found, or if bounds or missing degrees of freedom determine it."""
     if fit.stuck:
         yield (
             "no step improves the fit, but this is no minimum: nearby the motion fails, or is rougher than "
@@ -68,7 +68,7 @@ def _of_the_data(fit: Estimates) -> Iterator[str]:
             counted = np.round(r[np.isfinite(r)], 6)
             here = f"`{name}` of run {run}"
             there = first.setdefault(counted.tobytes(), here)
-            # so many different residuals are equal in two channels only by chance
+            # fewer different residuals may be equal in two channels by chance
             if here != there and len(np.unique(counted)) > 3:
                 yield (
                     f"{there} and {here} hold equal numbers: counted as two measurements, they make intervals"
@@ -89,7 +89,7 @@ def _of_the_data(fit: Estimates) -> Iterator[str]:
 
 def _of_residuals(fit: Estimates) -> Iterator[str]:
     """Yield warnings of residuals that are larger or smaller than sigmas allow, or not white."""
-    # standard deviations: a larger deviation of a mean square from 1 is significant
+    # standard deviations beyond which a mean square differs significantly from 1
     sizes, sure = _sizes_of_residuals(fit), 5.0
     coloured = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
     if large := [size for size in sizes if size.least > _by_chance(size.narrow, sure)]:
@@ -97,8 +97,8 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
     def larger(channels: list[str]) -> float:
-        """Return the loss of information by correlated residuals: (1 + rho)/(1 - rho) for a correlation rho
-        of neighbours.
+        """Return the factor by which correlated residuals increase variances: (1 + rho)/(1 - rho) for a
+        correlation rho of neighbours.
         """
         return max(
             (1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels))
@@ -135,23 +135,23 @@ class _Size(NamedTuple):
     """The mean square of the residuals of some channels, in sigmas."""
 
     channels: list[str]
-    named: str  # for the sentence; empty for all channels
-    least: float  # if they determined only their own unknowns
-    narrow: float  # its standard deviation for normal residuals
-    most: float  # if they determined all unknowns
-    wide: float
+    named: str  # names of the channels in the sentence; empty for all channels
+    least: float  # mean square if these channels determined only their own unknowns
+    narrow: float  # standard deviation of `least` for normal residuals
+    most: float  # mean square if these channels determined all unknowns
+    wide: float  # standard deviation of `most`
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return the mean square that lies this many standard deviations from 1. Its cube root is nearly normal
-    (Wilson and Hilferty). `spread`: the standard deviation of the mean square near 1.
+    """Return the mean square that lies this many standard deviations from 1, by the nearly normal
+    distribution of its cube root (Wilson and Hilferty). `spread`: the standard deviation of the mean square.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Return the sizes of the residuals: of all channels with known sigmas together, and of each such
-    channel. Under a robust loss, sizes are based on medians.
+    """Return the sizes of the residuals of all channels with known sigmas together, and of each such channel.
+    With a robust loss, sizes are based on medians.
     """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [
@@ -173,7 +173,7 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
 
 def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
     """Return the mean square of residuals that determined `determined` unknowns, and its standard deviation
-    for normal residuals; `robust`: computed from their median.
+    for normal residuals. If `robust`, the mean square is computed from the median.
     """
     degrees = max(squares.size - determined, 1)
     # the median of w^2 is 0.4549 for a normal w; its relative standard deviation for n residuals is 2.33 /

@@ -1,20 +1,20 @@
-"""Resumed fits: at the minimum, along a profile, and for other runs.
+"""Resumed fits: predictions for other runs, shares of information, and profiles.
 
-Predictions for other runs.
+Predictions for other runs:
 
     error = prediction - value,   rms^2 = mean error^2,   R^2 = 1 - sum error^2 / sum (value - mean)^2
 
 Means and sums are over all available samples of a channel. Shared unknowns are held at their estimates.
 Unknowns of a run (start values, numbers of its sensors) are fitted to that run.
 
-The share of each sample in the information on an unknown.
+The share of each sample in the information on an unknown:
 
     estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i
     share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k
 
 C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted; w_k: weight of
-sample k, one over the square of its sigma. Shares account for the estimation of all other unknowns. Those of
-all samples and priors add up to one. Source: R. D. Cook and S. Weisberg, Residuals and Influence in
+sample k, one over the square of its sigma. Shares account for the estimation of all other unknowns. The
+shares of all samples and priors add up to one. Source: R. D. Cook and S. Weisberg, Residuals and Influence in
 Regression (1982), section 2.2.
 
 Profile likelihood: the objective as a function of one unknown, minimised over all others.
@@ -22,10 +22,11 @@ Profile likelihood: the objective as a function of one unknown, minimised over a
     rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, held at x
     interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom
 
-inflation: as in the covariance, for the loss and for estimated sigmas; bounded: both ends exist; one-sided:
-one of them; flat: none, the data do not determine the unknown. Each point starts from the solution of its
-inner neighbour. Correlation times are held. Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37
-(1988) 87; A. Raue et al., Bioinformatics 25 (2009) 1923.
+inflation: as in the covariance, for the loss and for estimated sigmas. A profile is bounded if both ends
+exist, one-sided if only one exists, and flat if none exists, so that the data do not determine the unknown.
+The fit at each point starts from the solution at its inner neighbour. Correlation times are held. Source: D.
+J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25 (2009)
+1923.
 """
 
 from collections.abc import Iterable, Sequence
@@ -64,7 +65,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
     if isinstance(problem, Piecewise) and fit.shooting is not None:
         problem.put_nodes(theta, fit.shooting)
     at = problem.linearised(theta, np.array([0]))
-    # as in F; the fit's own sigmas account for its unknowns
+    # sigmas as in F; the sigmas of the fit are corrected for its unknowns
     sigma = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
     for run, residuals in enumerate(fit.residuals):
         again = problem.by_channel(run, at)
@@ -81,7 +82,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
 
 def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
     """Return the problem of a `Fit` for these runs. Raises ValueError if they do not match the scene.
-    `apart`: keep unknowns of runs separate from shared ones.
+    `apart`: whether unknowns of runs are kept separate from shared ones.
     """
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
@@ -156,7 +157,7 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     if not np.isfinite(at.cost[0]):
         raise ValueError("a motion of the held-out runs fails at the estimates; examine it with `simulate`")
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
-    # residuals are in units of sigmas; unknown sigmas were estimated from these runs
+    # residuals are in units of sigmas, and unknown sigmas were estimated from these runs
     ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
     residuals = [
         {name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()}
@@ -181,29 +182,29 @@ class Informed:
     """The shares of all samples in the information on some unknowns."""
 
     labels: Labels
-    # of each run, by channel, summed over its components
+    # shares of the samples of each run, by channel, summed over components
     of_samples: tuple[dict[str, Float[np.ndarray, "unknowns times"]], ...]
     times: tuple[Float[np.ndarray, "times"], ...]  # s
 
     @property
     def of_runs(self) -> Float[np.ndarray, "unknowns runs"]:
-        """Return the share of each run."""
+        """Return the share of each run in the information on each unknown."""
         return np.stack([sum(share.sum(axis=1) for share in run.values()) for run in self.of_samples], axis=1)
 
     @property
     def of_channels(self) -> dict[str, Float[np.ndarray, "unknowns"]]:
-        """Return the share of each channel in all runs."""
+        """Return the share of each channel, over all runs, in the information on each unknown."""
         names = dict.fromkeys(name for run in self.of_samples for name in run)
         return {name: sum(run[name].sum(axis=1) for run in self.of_samples if name in run) for name in names}
 
     @property
     def of_priors(self) -> Float[np.ndarray, "unknowns"]:
-        """Return the share of priors."""
+        """Return the share of the priors in the information on each unknown."""
         return 1 - self.of_runs.sum(axis=1)
 
     def half(self, unknown: int) -> tuple[int, float, float]:
-        """Return the run with most information on an unknown, and the shortest time span (first and last
-        sample) with half of this information.
+        """Return the run with the most information on an unknown, and the shortest time span (first and last
+        sample) that contains half of this information.
         """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
@@ -217,7 +218,7 @@ class Informed:
 
 def informed(problem: Problem, found: Minimum, most: int) -> Informed:
     """Return the shares of information on the first `most` unknowns that have a standard error. They depend
-    on sigmas alone, not on factors for the loss or for estimated sigmas.
+    only on the sigmas, not on factors for the loss or for estimated sigmas.
     """
     unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
     known = information(
@@ -263,7 +264,7 @@ class Profile(Printed):
     estimate: float
     values: Float[np.ndarray, "points"]  # increasing, with the estimate among them
     rise: Float[np.ndarray, "points"]  # zero at the estimate
-    low: float  # end of the interval; without an end from the data, the bound or infinity
+    low: float  # end of the interval; the bound or infinity if the data give no end
     high: float
     is_closed: tuple[bool, bool]  # whether the data determine each end
     kind: str  # "bounded", "one-sided" or "flat"

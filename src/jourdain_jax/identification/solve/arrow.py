@@ -1,21 +1,21 @@
-"""Least squares with unknowns shared by all runs and unknowns of single runs or pieces: an arrow-shaped
-matrix, which may contain a chain.
+"""Least squares with an arrow-shaped matrix: some unknowns are shared by all runs, others belong to single
+runs or pieces of runs. Consecutive pieces may be coupled.
 
     minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2
              + lambda |D d|^2
     [J_i S_i r_i] = Q_i [ T_i ; 0 ]
     [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; remainder of the next piece ] = Q_i' [ U_i ; remainder ]
 
-Piece i has residuals r_i, own unknowns x_i, the shared unknowns s, and a join with the piece before it, whose
-residuals are c_i; d = (ds, dx_0, ...). Only T_i is kept of the first QR factorisation. The second eliminates
-x_i, from the last piece of a run to the first. The singular values of the remainders of all runs give ds;
-directions below a cut-off do not move.
+Piece i has residuals r_i and own unknowns x_i; c_i are the residuals of its join with the previous piece; s
+are the shared unknowns; d = (ds, dx_0, ...). Only T_i of the first QR factorisation is stored. The second
+factorisation eliminates x_i, from the last piece of a run to the first. A singular value decomposition of the
+remainders of all runs gives ds, which is zero in directions below a cut-off.
 
-A run that is not cut is one piece without a join. Time and memory grow linearly with the number of pieces. A
-leading axis `members` holds problems of equal shape. All on NumPy. Source: G. H. Golub and V. Pereyra,
-Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D); G. J.
-Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (square-root information,
-the chain).
+A whole run is one piece without a join. Time and memory grow linearly with the number of pieces. A leading
+axis `members` holds several problems of equal shape. All arrays are NumPy's. Source: G. H. Golub and V.
+Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling
+D); G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (square-root
+information, the chain).
 """
 
 from collections.abc import Callable
@@ -30,17 +30,19 @@ Parts = TypeVar("Parts", bound="ByMember")
 ByUnknown = Float[np.ndarray, "members unknowns"]
 PerMember = Float[np.ndarray, "members"]
 Flags = Bool[np.ndarray, "members"]
-Members = Int[np.ndarray, "members"]  # their indices
+Members = Int[np.ndarray, "members"]  # indices of members
 
 
 class ByMember:
-    """Base of dataclasses of arrays with a leading axis of members. A missing part is None."""
+    """Base of dataclasses whose fields are arrays, or nested dataclasses, with a leading axis of members; or
+    None.
+    """
 
     def _parts(self) -> list:
         return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
 
     def of(self: Parts, members) -> Parts:
-        """Return the parts of some members."""
+        """Return the entries of some members."""
         return type(self)(
             *(
                 x if x is None else x.of(members) if isinstance(x, ByMember) else x[members]
@@ -49,7 +51,7 @@ class ByMember:
         )
 
     def put(self: Parts, members, new: Parts) -> None:
-        """Store the parts of `new` for these members."""
+        """Store `new` as the entries of these members."""
         for kept, one in zip(self._parts(), new._parts(), strict=True):
             if isinstance(kept, ByMember):
                 kept.put(members, one)
@@ -57,7 +59,7 @@ class ByMember:
                 kept[members] = one
 
     def replaced(self: Parts, members: np.ndarray, new: Parts, chosen: Bool[np.ndarray, "some"]) -> Parts:
-        """Return all members, with the `new` values of the `chosen` ones."""
+        """Return all members; the `chosen` ones have their `new` values."""
         count = len(next(x for x in self._parts() if isinstance(x, np.ndarray)))
         if len(members) == count and chosen.all():
             return new
@@ -85,7 +87,7 @@ class Arrow(ByMember):
 
     local: Float[np.ndarray, "members pieces local width"]  # the rows of T that contain own unknowns
     shared: Float[np.ndarray, "members rows columns"]  # the other rows of all pieces, as one triangle
-    # of each piece: gradient in the shared unknowns after fitting its own
+    # gradient of each piece in the shared unknowns, after its own unknowns were fitted
     scores: Float[np.ndarray, "members pieces _"]
     # [B A C c]; zero for the first piece of a run
     joins: Float[np.ndarray, "members pieces joined both"] | None = None
@@ -103,16 +105,16 @@ class Arrow(ByMember):
 
     @property
     def _blocks(self) -> list[np.ndarray]:
-        """Return up to three blocks of rows: with shared unknowns only, of single pieces, and of joins
-        between a piece and its predecessor.
+        """Return up to three blocks of rows: rows with shared unknowns only, rows of single pieces, and rows
+        of joins between a piece and its predecessor.
         """
         return [
             x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None
         ]
 
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
-        """Return the entries of x for the columns of each block; arbitrary entries for the missing
-        predecessor of a first piece.
+        """Return the entries of x for the columns of each block. A first piece has no predecessor, and the
+        entries for it are arbitrary.
         """
         shared, own = self.split(x)
         if len(self._blocks) == 1:
@@ -133,8 +135,8 @@ class Arrow(ByMember):
         return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
 
     def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
-        """Return the sum over all rows of `of`, for each column. `of` maps (..., rows, columns and residual)
-        to (..., columns).
+        """Return the sum of `of(block)` over all rows, for each column. `of` maps (..., rows, columns and
+        residual) to (..., columns).
         """
         shared, *others = map(of, self._blocks)
         pieces, m, _ = self.counts
@@ -169,7 +171,7 @@ class Arrow(ByMember):
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
     def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: ByUnknown) -> "Arrow":
-        """Return the problem of all other unknowns, with the residuals after the `held` ones have changed by
+        """Return the problem without the `held` unknowns, with the residuals after these have changed by
         `moved`.
         """
         blocks = [rows.copy() for rows in self._blocks]
@@ -201,8 +203,8 @@ class Arrow(ByMember):
 def with_prior(
     arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]
 ) -> Arrow:
-    """Return the arrow with the added `residual` (theta - mean) * weight of each unknown, zero without a
-    prior. For shared unknowns it is multiplied by M; the scores do not change.
+    """Return the arrow with prior residuals added: `residual` is (theta - mean) * weight of each unknown,
+    zero without a prior. Residuals of shared unknowns are multiplied by M. The scores do not change.
     """
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
@@ -216,9 +218,10 @@ def eliminated(
     local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows that express the unknowns of each piece by shared unknowns and the unknowns of the previous
-    piece; and the remaining rows, which have only shared unknowns.
+    piece, and the remaining rows, which contain only shared unknowns.
 
-    `below`: the diagonal (members, pieces, local) of additional rows, with a residual.
+    `below`: the diagonal (members, pieces, local) of additional rows for the pieces' unknowns; `residual`:
+    the residuals of these rows.
     """
     members, pieces, m, width = local.shape
     if not m:

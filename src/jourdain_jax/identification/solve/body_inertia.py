@@ -1,14 +1,14 @@
-"""The inertia of one body as unknowns of a fit: second moments that are not negative, and shears.
+"""The inertia of one body as unknowns of a fit: nonnegative second moments, and shears.
 
 The scene has a parameter for each moment of inertia.
 
     I_ij = c_k p_k                      each entry is zero, or a parameter p_k times a constant c_k
     I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-I: inertia matrix; S: second moments of the mass about its centre. Exactly the possible inertias have this
-form. I is linear in D, so that a flat body, with a zero D, is at an ordinary bound. Moments of inertia about
-two axes with one parameter are equal, and so are the two D. The parameters p_k are found by differentiating
-the inertia matrix.
+I: inertia matrix; S: second moments of the mass about its centre. An inertia matrix has this form if and only
+if a distribution of mass can have it. I is linear in D; a flat body has a zero D, which is an ordinary bound.
+If two axes share one parameter, their moments of inertia are equal, and so are their D. The parameters p_k
+are found by differentiating the inertia matrix.
 """
 
 from collections.abc import Callable
@@ -45,11 +45,12 @@ def possible_inertia() -> PossibleInertia:
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
-    I: moments and products of inertia (kg m^2, about the mass centre). Unknowns of the fit are second moments
-    D (kg m^2) and shears l instead, `"rear frame second moment[0]"` and `"rear frame shear[0]"`.
-    Principal moments of inertia are then positive, and each is at most the sum of the other two. `Fit.tied`
-    has moments and products with standard errors and intervals to first order, except for a flat body, with D
-    at its bound. Two axes that share one parameter, as for a wheel, share one D.
+    I: moments and products of inertia (kg m^2, about the mass centre). In their place, the fit has second
+    moments D (kg m^2) and shears l as unknowns, such as `"rear frame second moment[0]"` and
+    `"rear frame shear[0]"`. Principal moments of inertia are then positive, and each is at most the sum of
+    the other two. `Fit.tied` has moments and products with standard errors and intervals to first order,
+    except for a flat body, with D at its bound. Two axes that share one parameter, as for a wheel, share one
+    D.
 
     The scene must have a parameter for each of the three moments, and for none, one or all of the products.
     Otherwise, or if no body of nonzero thickness has the inertia of the first guess, `fit` raises ValueError.
@@ -72,7 +73,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class BodyInertia:
-    """The parameters of a scene that are the inertia of a body; hashable."""
+    """The parameters of a scene that make up the inertia of a body; hashable."""
 
     body: str
     entries: tuple[Entry, ...]  # the first entry of each parameter
@@ -81,11 +82,13 @@ class BodyInertia:
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Return names of the entries of D and of l."""
+        """Return the names of the unknowns D and l."""
         return f"{self.body} second moment", f"{self.body} shear"
 
     def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:
-        """Return D and l for a scene's parameters; NaN if no body of nonzero thickness has such moments."""
+        """Return D and l for a scene's parameters, or NaN if no body of nonzero thickness has such
+        moments.
+        """
         value = {
             (entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index]
             for entry in self.entries
@@ -99,8 +102,8 @@ class BodyInertia:
         for i, j in (_PRODUCTS[k] for k in self.products):
             I = I.at[i, j].set(value[i, j]).at[j, i].set(value[i, j])
         S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
-        # L diag(D)^1/2 is upper triangular: the lower factor of S with reversed rows and columns, reversed
-        # back
+        # L diag(D)^1/2 is upper triangular: the lower Cholesky factor of S with reversed rows and columns,
+        # reversed again
         A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
         D = jnp.diag(A) ** 2
         l = [A[i, j] / A[j, j] for i, j in (_PRODUCTS[k] for k in self.products)]
@@ -111,7 +114,7 @@ class BodyInertia:
     def values(
         self, D: Float[Entries, "*members moments"], l: Float[Entries, "*members shears"]
     ) -> list[Float[Array, "*members"]]:
-        """Return the parameter of every entry."""
+        """Return the parameter of every entry, for these D and l."""
 
         def inertia(D, l):
             L = jnp.eye(3, dtype=D.dtype)

@@ -26,8 +26,8 @@ Kind = Literal["scene", "inertia", "start", "sensor"]
 
 @dataclass(frozen=True)
 class Place:
-    """Location of the entries of a parameter, an initial value, or a number of a sensor or actuator, in a
-    vector of unknowns.
+    """The range that a parameter, an initial value, or a number of a sensor or actuator occupies in a vector
+    of unknowns.
     """
 
     name: str  # for a sensor or actuator: "gyro.gain"
@@ -41,8 +41,8 @@ class Place:
         return self.begin + math.prod(self.shape)
 
     def of(self, vector):
-        """Return the numbers of this entry from a vector (or from many, with leading axes), in their own
-        shape.
+        """Return the entries of this range of a vector (or of many, with leading axes), in the shape of the
+        quantity.
         """
         return vector[..., self.begin : self.end].reshape((*vector.shape[:-1], *self.shape))
 
@@ -67,19 +67,19 @@ class Layout:
 
     @property
     def parameters(self) -> set[str]:
-        """Return names of the parameters that differ from the scene's."""
+        """Return the names of the parameters that the unknowns determine."""
         return {place.name for place in self.shared if place.kind == "scene"} | set(self.following)
 
     @property
     def following(self) -> Labels:
-        """Return names of parameters that follow from unknowns: of inertias of bodies, and tied ones."""
+        """Return the names of dependent parameters: entries of free inertias, and tied parameters."""
         names = [entry.name for body in self.bodies for entry in body.entries]
         return tuple(dict.fromkeys([*names, *(tie.name for tie in self.ties)]))
 
     def scene(self, scene: Scene, shared: Float[Entries, "*members shared"]) -> Scene:
-        """Return the scene with these shared unknowns."""
+        """Return the scene for these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
-        # with the index of each parameter's leaf
+        # `names` has the index of each parameter's leaf in place of its value
         found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))
         for place in self.shared:
             if place.kind == "scene":
@@ -91,7 +91,7 @@ class Layout:
                 own = jnp.broadcast_to(found[leaf], value.shape + jnp.shape(leaves[leaf]))
                 found[leaf] = own.at[(..., *entry.index)].set(value)
         for tie in self.ties:
-            # parameters of members have leading axes, shared ones have none
+            # parameters that differ between members have leading axes
             function = tie.value
             axes = [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
             for _ in shared.shape[:-1]:
@@ -102,7 +102,7 @@ class Layout:
         )
 
     def start(self, start: dict, *vectors: Float[Entries, "*members _"]) -> dict:
-        """Return the start of a run for these shared unknowns and its own."""
+        """Return the start of a run for these shared unknowns and unknowns of the run."""
         return start | {name: x for name, x in self._of_kind("start", vectors) if name in start}
 
     @property
@@ -111,12 +111,12 @@ class Layout:
         return any(place.kind == "sensor" for place in (*self.shared, *self.local))
 
     def known(self, *vectors) -> dict[str, Array | np.ndarray]:
-        """Return numbers of sensors and actuators by name, of one run."""
+        """Return the unknown numbers of sensors and actuators of one run, by name."""
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:
-        """Return names of the unknowns of a kind, with their values in the vectors of shared unknowns and of
-        a run.
+        """Return names and values of the unknowns of a kind, from the vectors of shared unknowns and of a
+        run.
         """
         return (
             (place.name, place.of(x))

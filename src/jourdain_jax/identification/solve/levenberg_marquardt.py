@@ -1,22 +1,21 @@
-"""Levenberg-Marquardt within bounds, for expensive residuals: one simulation with all its derivatives per
-trial step.
+"""Levenberg-Marquardt within bounds for expensive residuals: each trial step needs one simulation with
+derivatives.
 
     minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
     step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J
                steps end at bounds, and the other unknowns are solved again
-    patience   a member ends if F is large and has not decreased much within so many steps
+    patience   a member stops if F is large and has not decreased much within this number of steps
     converged  the undamped step has |J d| <= `tolerance`, in standard errors, and moves no unknown
                by more than that fraction of its size
 
-Steps end at bounds, since a transformation onto the interior never reaches them. In ten fits of a damping
-that is zero, all converge in 4 steps here; with its logarithm as unknown, seven had not converged in 256. The
-method of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be
-differentiated with respect to the starts of all others. It has no bounds. It evaluates residuals and
-derivatives separately.
+Unknowns can lie exactly at a bound, which a transformation onto the interior never reaches. Ten fits of a
+damping whose true value is zero converge in 4 steps; with the logarithm as unknown, seven had not converged
+in 256. optimistix is not used, because its Jacobian is dense (each run would be differentiated with respect
+to the starts of all others), it has no bounds, and it evaluates residuals and derivatives separately.
 
-Several problems of one shape (`members`) run as a batch; finished ones cost nothing. Source: D. W. Marquardt,
-SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum
-slopes instead of values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
+Several problems of one shape (`members`) run as a batch; finished members are not evaluated. Source: D. W.
+Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near
+the minimum slopes instead of values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 """
 
 from collections.abc import Callable
@@ -37,10 +36,10 @@ class Linearised(ByMember):
 
     cost: PerMember  # F; not finite if the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
-    # (members, runs) of residuals of all samples, not whitened; None if another run had failed
+    # residuals of all samples, not whitened, by (member, run); None if another run has failed
     residuals: np.ndarray
     sigma: Float[np.ndarray, "members channels"]  # of channels with estimated noise
-    # of [J r]: first for channels with known sigma, then for each other channel
+    # triangles of [J r]: first for all channels with known sigma, then for each other channel
     triangles: Float[np.ndarray, "members runs kinds width width"]
     squares: Float[np.ndarray, "members kinds"]  # sums of their squared residuals
 
@@ -58,21 +57,21 @@ class Control:
 
 @dataclass
 class Minimum(ByMember):
-    """The final or present state of the minimisation of each member."""
+    """The current or final state of the minimisation of each member."""
 
     theta: ByUnknown
     at: Linearised
     going: Flags
     converged: Flags
-    stuck: Flags  # no step lowers F, but this is no minimum
-    steps: Members  # tried
-    grown: Flags  # whether growing spans found it
+    stuck: Flags  # no step lowers F, but the point is no minimum
+    steps: Members  # number of trial steps
+    grown: Flags  # whether growing spans found the minimum
     trace: np.ndarray  # (members,) of tuples of (objective, F initially and after each tried step)
 
     @staticmethod
     def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
-        """Return the state before the first step; members whose motion fails are excluded. `what`: the name
-        of the objective in the trace.
+        """Return the state before the first step. Members whose motion fails do not run. `what`: the name of
+        the objective in the trace.
         """
         none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
         trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
@@ -93,7 +92,7 @@ class Minimum(ByMember):
         return here[~done]
 
     def go(self, here: Members, end: ByUnknown, trial: Linearised, better: Flags) -> None:
-        """Accept the steps that are `better`."""
+        """Accept the steps marked as `better`."""
         self.theta[here[better]] = end[better]
         self.at = self.at.replaced(here, trial, better)
         for b in here.tolist():
@@ -101,7 +100,7 @@ class Minimum(ByMember):
             self.trace[b] = ((what, (*costs, float(self.at.cost[b]))),)
 
     def give_up(self, members) -> None:
-        """Stop these members, which have found no step."""
+        """Stop these members, for which no step lowers F."""
         self.stuck[members], self.going[members] = True, False
 
     def lowest(self) -> "Minimum":
@@ -109,7 +108,7 @@ class Minimum(ByMember):
         return self if len(self.theta) == 1 else self.of([int(np.argmin(self.at.cost))])
 
     def agreeing(self, apart: float) -> int:
-        """Return the number of members that converged to a value at most `apart` above the lowest one."""
+        """Return the number of members that converged to an F at most `apart` above the lowest."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":
@@ -119,11 +118,11 @@ class Minimum(ByMember):
         return found
 
     def continued(self, members: Members, new: "Minimum") -> "Minimum":
-        """Return all members. `members` get the results of `new`, which began at theirs; steps add up."""
+        """Return all members. `members` get the results of `new`, which continued from them; steps add up."""
         return self.replaced(members, new.after(self, members), np.ones(len(members), bool))
 
     def after(self, before: "Minimum", members: Members) -> "Minimum":
-        """Return these members, with steps and trace of the earlier attempt added."""
+        """Return these members with the steps and the trace of the earlier attempt `before` added."""
         return replace(
             self,
             steps=before.steps[members] + self.steps,
@@ -139,8 +138,8 @@ def minimise(
     control: Control,
     what: str = "",
 ) -> Minimum:
-    """Return the minimum from `theta`. `evaluate(theta, members)` returns value and derivatives for the
-    members at these numbers; `what`: the name of the objective in the trace.
+    """Return the minimum found from `theta`. `evaluate(theta, members)` returns value and derivatives for
+    some members; `what`: the name of the objective in the trace.
     """
     way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta))), what)
     full = np.ones(len(theta))
@@ -165,11 +164,11 @@ def minimise(
         trial, promised = evaluate(x + d, here), slope - 0.5 * change
         gained = fallen(way.at.cost[here], trial, d, slope, promised, control)
         better = np.isfinite(gained) & (gained > 1e-4 * promised)
-        # damping rises after overshooting: with large residuals, undamped steps oscillate along poorly
+        # more damping after overshooting: with large residuals, undamped steps oscillate along poorly
         # determined directions
         by = np.where(gained > 0.9 * promised, 1 / fall[here], np.where(gained < 0.6 * promised, 3.0, 1.0))
         damping[here] = np.maximum(damping[here] * np.where(better, by, growth[here]), LEAST)
-        # after a failed step, damping decreases slowly: in a curved valley every other step would fail
+        # damping decreases slowly after a failed step; otherwise every other step fails in a curved valley
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], 10.0), 2.0)
         growth[here] = np.where(better, 4.0, 2 * growth[here])
         way.go(here, x + d, trial, better)
@@ -187,9 +186,9 @@ def fallen(
 ) -> PerMember:
     """Return the decrease of F along a step d.
 
-    Near the minimum, errors of the simulation hide small changes of F: F jumps when a motion takes another
-    step. There the decrease is computed from the derivatives of F at both ends of the step; the first is
-    `slope`.
+    Near the minimum, errors of the simulation hide small changes of F, which jumps when the number of steps
+    of a motion changes. There the decrease is computed from the derivatives of F at both ends of the step;
+    `slope` is the first.
     """
     found = before - trial.cost
     by_slopes = 0.5 * (slope - np.einsum("bi,bi->b", trial.arrow.gradient, d))
@@ -200,8 +199,8 @@ def fallen(
 
 
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
-    """Return D, the lengths of the columns of J. For an unknown with almost no effect, length times size is
-    1e-8 of the largest one.
+    """Return D, the lengths of the columns of J. Length times size of an unknown is at least 1e-8 of the
+    largest such product.
     """
     norms = arrow.column_norms
     by_size = norms * size
@@ -214,8 +213,8 @@ def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
 
 def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: float) -> np.ndarray:
     """Return the damped step within the bounds."""
-    # an unknown with a bound above zero shrinks at most to a tenth per step, since motions with tiny masses
-    # and lengths take long
+    # an unknown with a bound above zero shrinks at most to a tenth per step: motions with tiny masses and
+    # lengths need many steps
     g, low = arrow.gradient, np.where(unknowns.low > 0, np.maximum(unknowns.low, 0.1 * theta), unknowns.low)
     held = unknowns.fixed | ((theta <= unknowns.low) & (g >= 0)) | ((theta >= unknowns.high) & (g <= 0))
     moved = np.zeros(theta.shape)

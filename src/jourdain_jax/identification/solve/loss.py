@@ -1,4 +1,4 @@
-"""Losses of a fit: a residual r counts by its square, or less if it is an outlier.
+"""Losses of a fit: rho(r) grows like r^2 for small residuals r, and more slowly for outliers.
 
     minimise sum rho(r)
     weights     w = rho'(r) / r     least squares of sqrt(w) r and sqrt(w) J has the same gradient
@@ -62,8 +62,8 @@ class Loss:
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
     def bend(self, r: Residuals) -> float:
-        """Return the factor from (J'WJ)^-1 to the inverse second derivative of F; infinite if F is not convex
-        in the residuals.
+        """Return the ratio of the inverse second derivative of F to (J'WJ)^-1; infinite if F is not convex in
+        the residuals.
         """
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
@@ -80,9 +80,9 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 
 def huber(k: Number = 1.345) -> Loss:
-    """Return a loss that counts residuals beyond `k` sigmas by magnitude instead of by square: `jj.fit(...,
-    loss=jj.identification.huber())`. The default has 95 % of the efficiency of least squares for normal
-    noise.
+    """Return a loss that grows with the magnitude of residuals beyond `k` sigmas instead of their square:
+    `jj.fit(..., loss=jj.identification.huber())`. The default has 95 % of the efficiency of least squares for
+    normal noise.
 
     Raises ValueError unless k is positive and finite.
     """
@@ -90,7 +90,7 @@ def huber(k: Number = 1.345) -> Loss:
 
 
 def student_t(degrees: Number = 4.0) -> Loss:
-    """Return the loss for noise distributed as Student's t, under which outliers hardly count. Fewer
+    """Return the loss for noise distributed as Student's t, in which outliers have little weight. Fewer
     `degrees` of freedom mean heavier tails. Sigma is then the scale of the noise.
 
     Raises ValueError unless the degrees are positive and finite.

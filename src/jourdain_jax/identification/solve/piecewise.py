@@ -1,13 +1,13 @@
-"""Predictions of runs cut into pieces, each with its own start, and predictions of whole runs condensed from
-them.
+"""Predictions of runs that are cut into pieces, each with its own start, and predictions of whole runs
+condensed from those.
 
     joined      all starts s_i of pieces are unknowns; residuals (x(t_i+1; s_i, theta) - s_i+1) / width
     condensed   continuity is solved for, to first order:
                 ds_i+1 = A_i ds_i + B_i dtheta + c_i,     c_i = x(t_i+1; s_i, theta) - s_i+1
                 ds_i = L_i (dx_0, dtheta) + g_i           x_0: start of the run
 
-Once pieces join (c = 0), residuals and derivatives equal the whole run's. Source: H. G. Bock, in: Modelling
-of Chemical Reaction Systems (1981) 102.
+Once pieces join (c = 0), residuals and derivatives equal those of the whole run. Source: H. G. Bock, in:
+Modelling of Chemical Reaction Systems (1981) 102.
 """
 
 import itertools
@@ -40,7 +40,7 @@ class Shot:
     """Pieces of a fit by multiple shooting, and their continuity."""
 
     pieces: tuple[int, ...]  # number for each run
-    # the largest jump between neighbouring pieces, in tolerances of the options, atol + rtol |x|
+    # largest jump between neighbouring pieces, in tolerances of the simulation, atol + rtol |x|
     continuity: Float[np.ndarray, ""]
     sizes: Float[np.ndarray, "states"]  # of coordinates, speeds, and states of low-pass filters of sensors
     nodes: tuple[Float[np.ndarray, "nodes states"], ...]  # states (q, u, y) at the joints of each run
@@ -48,12 +48,12 @@ class Shot:
 
 @dataclass
 class _Standing(ByMember):
-    """The current unknowns of the pieces of all members, and the results there."""
+    """The current unknowns of the pieces of all members, with residuals and derivatives."""
 
     # unknowns of each piece, with its start state (node)
     local: Float[np.ndarray, "members pieces states_and_own"]
     theta: Float[np.ndarray, "members places"]  # unknowns of the whole runs
-    # (members, runs) of [J g r] of the whole runs: r changes by g, to first order, when pieces join
+    # [J g r] of the whole runs by (member, run): to first order, r changes by g when pieces join
     rows: np.ndarray
     slopes: Float[np.ndarray, "members pieces states_and_own unknowns"]  # L
     gaps: Float[np.ndarray, "members pieces states_and_own"]  # g
@@ -82,11 +82,10 @@ class Piecewise(Problem):
             )
         self.run_of = np.repeat(
             np.arange(len(runs)), [len(of_run) for of_run in of_each]
-        )  # run of each piece
+        )  # index of the run of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
-        # numbers of sensors are equal in all pieces: these unknowns of a piece, and its node, are determined
-        # by the previous piece
+        # a piece has the sensor numbers of the previous piece, whose end state is its node
         self._carried = np.array(
             [k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)],
             int,
@@ -124,8 +123,8 @@ class Piecewise(Problem):
         return self._each(theta, 0.0, 0.0, 0.0)
 
     def _each(self, of_runs: np.ndarray, later, first_node, later_node, carried: bool = True) -> np.ndarray:
-        """Return the unknowns of all pieces from those of whole runs; `later`: the start values of later
-        pieces; `carried`: whether shared sensor numbers are copied to all pieces.
+        """Return the unknowns of all pieces from the unknowns of whole runs. `later`: the start values of
+        later pieces; `carried`: whether shared sensor numbers are copied to all pieces.
         """
         shared, own = self.unknowns.split(of_runs)
         own = own[..., self.run_of, :]
@@ -150,8 +149,8 @@ class Piecewise(Problem):
     def _from_before(
         self, ends: np.ndarray, local: np.ndarray, piece: int
     ) -> Float[np.ndarray, "members decided width"]:
-        """Return [A B c], a linear model of a gap: the end of a piece as a function of its predecessor's
-        unknowns, minus the next piece's start.
+        """Return [A B c], a linear model of the gap between the end of the previous piece and the start of
+        this one.
         """
         carried = np.zeros((len(local), self._carried.size, ends.shape[-1]))
         carried[:, range(self._carried.size), self._carried], carried[..., -1] = (
@@ -163,8 +162,8 @@ class Piecewise(Problem):
         return rows
 
     def with_gaps(self, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
-        """Return the objective with the starts of all pieces as unknowns. Gaps are residuals of this width,
-        in sizes of the states.
+        """Return the objective with the starts of all pieces as unknowns. Gaps are residuals with the sigma
+        `width`, in sizes of the states.
         """
         (some, ends), local = self.with_ends(theta, members), self.pieces.unknowns.split(theta)[1]
         at = self.pieces.assembled(theta, members, some, np.zeros((len(theta), len(self.with_memory))))
@@ -194,7 +193,7 @@ class Piecewise(Problem):
         return whole.copy()
 
     def put_nodes(self, theta: ByUnknown, found: Shot) -> None:
-        """Set the pieces to the end of another fit of the same runs."""
+        """Set the pieces to the result of another fit of the same runs."""
         self.measure(found.sizes)
         whole = self.spread(theta)
         local = self.pieces.unknowns.split(whole)[1]  # a view
@@ -202,7 +201,7 @@ class Piecewise(Problem):
         self.put(whole)
 
     def told(self) -> Shot:
-        """Return the pieces and their continuity."""
+        """Return nodes, sizes and continuity of the pieces."""
         nodes = self.at.local[0, :, self.own :]
         return Shot(
             pieces=tuple(np.bincount(self.run_of).tolist()),
@@ -216,8 +215,8 @@ class Piecewise(Problem):
         self.at = self.at.of([member])
 
     def evaluated(self, theta: ByUnknown, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of whole runs. The starts of pieces follow the unknowns, to first order, until the
-        pieces join.
+        """Yield [J r] of whole runs. The starts of pieces are moved with the unknowns, to first order, until
+        the pieces join.
         """
         failed = np.zeros(len(members), bool)
         for _ in range(8):
@@ -249,8 +248,8 @@ class Piecewise(Problem):
         return max(where.stop for where in self.group_of[run].channels.values()), self.own + self.shared + 2
 
     def change(self, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
-        """Return |J d + g|, the change of all residuals in units of sigma by a step d that also closes the
-        gaps.
+        """Return |J d + g|, the change of all residuals, in units of sigma, due to a step d that also closes
+        the gaps.
         """
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
@@ -269,7 +268,7 @@ class Piecewise(Problem):
         return np.concatenate([own[:, self.run_of], each], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
-        """Return the largest factor by which small changes of the unknowns grow after the first joint, in
+        """Return the largest factor by which small changes of the unknowns grow beyond the first node, in
         sizes of states and unknowns.
         """
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
@@ -281,8 +280,8 @@ class Piecewise(Problem):
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """Return a context in which the objective can be evaluated at other unknowns. Its exit restores the
-        pieces.
+        """Return a context in which the objective can be evaluated at other unknowns. On exit the pieces are
+        restored.
         """
         kept = self.at.of(np.arange(len(self.at.theta)))
         yield
@@ -302,7 +301,7 @@ class Piecewise(Problem):
 
     def _move(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Flags:
         """Move the pieces of some members to other unknowns. Return which members do not fail there; failing
-        ones do not move.
+        members are not moved.
         """
         m, M = self.own, self.own + self.states
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)
@@ -355,7 +354,7 @@ class Piecewise(Problem):
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of a piece that belong to its run, and their indices there."""
+        """Return the residuals of a piece that belong to its run, and their indices in the run."""
         run = int(self.run_of[piece])
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])

@@ -78,17 +78,17 @@ class Problem:
             max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values)
             for name in self.estimated
         ]
-        # lower limit of these sigmas, reached by an exact fit
+        # lower limit of the estimated sigmas, reached by an exact fit
         self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])
         self.with_memory = tuple(
             sorted({name for run in runs for name in run.unknown_correlation})
         )  # channels whose correlation time is estimated
-        # s, of these channels; initially as for white noise
+        # s, correlation times of these channels; initially as for white noise
         self.tau = np.zeros((self.count, len(self.with_memory)))
         self.failed = False  # whether any motion has failed
 
     def one(self, x: np.ndarray) -> np.ndarray:
-        """Return values without their axis of members if the experiment has no repeats."""
+        """Return `x` without its axis of members if the experiment has no repeats."""
         return np.asarray(x[0]) if self.single else x
 
     def taus(self, members: np.ndarray) -> np.ndarray:
@@ -125,13 +125,13 @@ class Problem:
         return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
 
     def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
-        """Return the minimum over all unknowns but one, held at this value. It is accurate to one per cent of
-        a standard error.
+        """Return the minimum over all unknowns but one, which is held at `value`. It is accurate to one per
+        cent of a standard error.
         """
         unknowns, control, fixed = self.unknowns, self.asked.control, self.unknowns.fixed.copy()
         begin = np.clip(theta, unknowns.low, unknowns.high)
         begin[0, place], fixed[place] = value, True
-        # tolerance in standard errors: the value of F matters here, not the location of the minimum
+        # tolerance in standard errors: only the value of F matters here, not the location of the minimum
         roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
         evaluate = lambda x, _: self.linearised(x, np.array([member]))
         return minimise(evaluate, begin, replace(unknowns, fixed=fixed), roughly)
@@ -211,8 +211,8 @@ class Problem:
     def is_followed(
         self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float
     ) -> Bool[np.ndarray, "members shares"]:
-        """Return whether the mean squared residual over each share of the span is at most `most` times its
-        value for noise.
+        """Return whether the mean squared residual over each of these shares of the runs is at most `most`
+        times that of noise.
         """
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
@@ -254,13 +254,13 @@ class Problem:
     def doubt(
         self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the contribution of estimated correlation times to each squared standard error C, (members,
-        unknowns), relative to C; and the variance of log C.
+        """Return the contribution of estimated correlation times to each squared standard error C (members,
+        unknowns), relative to C; and the variance of log C. Both are zero if no correlation time is
+        estimated.
 
-        Moments are taken over the restricted likelihood of each correlation time, with weights uniform in
+        Moments are taken over the restricted likelihood of each correlation time, with a uniform prior of
         arcsin rho (Jeffreys' prior of AR(1) noise). The total variance is the mean of C plus the variance of
-        the estimates, both over the correlation time. `of` returns standard errors and changes of the
-        estimates for an arrow matrix. The result is zero if no correlation time is estimated.
+        the estimates. `of(arrow)` returns standard errors and changes of the estimates for an arrow matrix.
         """
         members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
@@ -270,7 +270,7 @@ class Problem:
             low, high = correlation_limits(self.runs, name)
             interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))
-            # nodes in standard deviations of arcsin rho, which are 1 / sqrt(samples) without unknowns
+            # nodes in standard deviations of arcsin rho: 1 / sqrt(samples) if there were no unknowns
             nodes = angle(taus[:, k])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
             inside = (nodes >= angle(low)) & (nodes <= angle(high))
             found = []
@@ -303,7 +303,7 @@ class Problem:
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
         """Return the residuals of a run by channel in units of sigma, (members, *samples). They are NaN for
-        missing samples, and for members with another failed run. `white`: return whitened residuals.
+        missing samples, and for members of which another run failed. `white`: whether to whiten them.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
@@ -335,8 +335,8 @@ class Problem:
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
-    """Return [J r] from [J g r] for pieces of a run with gaps. g is the first-order change of r from closing
-    the gaps.
+    """Return [J r + g] from [J g r] of a run cut into pieces; g is the first-order change of r when gaps are
+    closed.
     """
     if rows.shape[-1] == unknowns + 1:
         return rows

@@ -31,8 +31,8 @@ from jourdain_jax.structure.structure import Reference
 
 
 def equal_runs(data: Sequence[Experiment]) -> list[tuple[Indices, Run]]:
-    """Stack runs of equal structure and shapes, and return each stack with the indices of its runs. Numbers
-    may be traced.
+    """Stack runs of equal structure and shapes. Return each stack with the indices of its runs. Numbers may
+    be traced.
     """
     groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in grouped(data):
@@ -109,7 +109,7 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     )
 
 
-# indices of members in the request, runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
+# indices of the requested members, runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]
 _BY_MEMBER = ("values", "weights")  # fields of a run that differ by member
 
@@ -157,7 +157,7 @@ class Group:
             for name in sorted({name for run in data for name in run.unknown_correlation})
         ]
         self._chains = Chains.of(self.weights, self._ts, taus, self.channels, unknown) if taus else None
-        # one row of numbers per run: an array argument costs as much as some steps of a motion
+        # all numbers of a run are one row, since each array argument costs as much as some steps of a motion
         self._common = _rows((scene, options), (1, 1))[0]
         of_members = [self._count if name in _BY_MEMBER else 1 for name in Run._fields]
         self._rows = np.stack([_rows(run, of_members) for run in filled])
@@ -166,13 +166,13 @@ class Group:
         self._run = _program(Reference(scene, layout.parameters), treedef, shapes, layout)
         saved = times if first.grid is None else first.grid.shape[0]
         states = saved * len(state_names(scene)) * 8 * (1 + sum(layout.sizes))
-        # 2^20 bytes of saved states with tangents in one loop; 50 fits of a disc at 2^18, 2^19 and 2^20 bytes
-        # take 25.7, 23.9 and 21.6 ms by machine code, 172, 143 and 132 ms by XLA
+        # saved states with tangents of one batch take 2^20 bytes; with 2^18, 2^19 and 2^20 bytes 50 fits of a
+        # disc take 25.7, 23.9 and 21.6 ms by machine code, 172, 143 and 132 ms by XLA
         most, total = int(min(64, max(1, 2**20 // states))), self._count * len(runs)
-        # as many in each batch, so that the last one needs no copies
+        # equal batches, so that the last one needs few copies
         self._width, self._fewest = most if total <= most else -(-total // -(-total // most)), 1
         self._threads = os.cpu_count() or 1
-        self._pool = ThreadPoolExecutor(self._threads)  # for all evaluations; threads start where needed
+        self._pool = ThreadPoolExecutor(self._threads)  # for all evaluations; threads start on demand
 
     def places(self, runs: np.ndarray) -> np.ndarray:
         """Return the positions of these runs in the group."""
@@ -196,7 +196,7 @@ class Group:
         The last batch is padded with copies of its last lane.
         """
         count = members * len(self.runs)
-        # remaining lanes run eight at a time, which costs less than another program for fewer
+        # remaining lanes run eight at a time, which is cheaper than compiling a program for fewer
         width, self._fewest = self._width, max(self._fewest, min(count, 8))
         while width >= 2 * max(count, self._fewest):
             width = -(-width // 2)
@@ -257,8 +257,8 @@ def _of_members(run: Run, of: Callable) -> Run:
 
 
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
-    """Return all numbers of some trees in the order of `ravel_pytree`, one row per member. A tree without an
-    axis of members is repeated in every row.
+    """Return all numbers of some trees in the order of `ravel_pytree`, one row per member. Trees without an
+    axis of members are repeated in every row.
     """
     parts = [
         np.asarray(x).reshape(count, -1)
@@ -272,7 +272,7 @@ def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members
 
 
 def _from_vector(tree) -> Callable:
-    """Return the inverse of `ravel_pytree(tree)[0]`, for which no number is computed."""
+    """Return the inverse of `ravel_pytree(tree)[0]`, without computing that vector."""
     found: list[Callable] = []
     jax.eval_shape(lambda tree: found.append(ravel_pytree(tree)[1]), tree)
     return found[0]
@@ -283,8 +283,8 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     """Compile [J r], shape (lanes, samples, local + shared + 1), as a function of the shared numbers and one
     row of run numbers and unknowns per lane.
 
-    `reference`: the scene's; `treedef`, `leaves`: structure of scene, options and run, with shapes in place
-    of arrays.
+    `reference`: reference of the scene; `treedef`, `leaves`: structure of scene, options and run, with shapes
+    in place of arrays.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
     zero = lambda x: np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
@@ -303,10 +303,10 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
-            # with dense matrices, r has one copy for each direction
+            # with dense matrices, r is returned once for each direction
             directions = np.eye(
                 max(unknowns, 1), unknowns, dtype=x.dtype
-            )  # one zero direction if nothing is free
+            )  # one zero direction if there are no unknowns
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)))(directions)
         return jnp.concatenate([J[:unknowns], r[:1]]).T
 

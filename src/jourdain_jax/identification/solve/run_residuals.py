@@ -30,7 +30,7 @@ class Run(NamedTuple):
 
     t0: Float[Entries, ""]
     ts: Times
-    # s, equal intervals; times of the motion if sensors have delays or lags
+    # s, at equal intervals: the times of the motion if sensors have delays or lags
     grid: Float[Entries, "grid"] | None
     values: dict[str, Numbers]
     weights: dict[str, Numbers]
@@ -46,13 +46,13 @@ class Run(NamedTuple):
         for drive in self.drives.values():
             inputs = drive.put_into(inputs)
         if options.backend == "auto" and any(drive.unknown for drive in self.drives.values()):
-            options = replace(options, backend="xla")  # this backend differentiates with respect to samples
+            options = replace(options, backend="xla")  # for derivatives with respect to samples
         return simulate(
             scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options
         )
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
-        """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
+        """Return `(reading - value) / sigma` by channel, and for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
         if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()):
@@ -76,8 +76,8 @@ class Run(NamedTuple):
         return found | ended(motion, filters, self.start, ts)
 
     def stops(self, event: StopEvent, name: str, motion: Callable) -> Scalar:
-        """Return the time at which the motion stops at the event of the channel `name`. Samples may end long
-        before it.
+        """Return the time at which the motion stops at the event of the channel `name`, which may be long
+        after the last sample.
         """
         observed = jnp.max(jnp.where(self.weights[name] > 0, self.values[name] - self.t0, 0.0))
         return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))
@@ -94,8 +94,8 @@ class Run(NamedTuple):
 
 
 def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
-    """Return the run with its weights. `xp`: NumPy, or `jax.numpy` for traced numbers; `repeats`: values have
-    a leading axis.
+    """Return the prepared run with its weights. `xp`: NumPy, or `jax.numpy` for traced numbers; `repeats`:
+    whether values have a leading axis.
     """
     weights = {}
     for name, values in data.values.items():

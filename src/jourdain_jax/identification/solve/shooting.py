@@ -13,8 +13,8 @@ GAMM-Mitteilungen 30 (2007) 376.
 
 Nodes are the states s = (q, u, y) between pieces: coordinates, speeds, and filter outputs y.
 
-A piece begins at the nearest state on the constraints, and continuity holds for all numbers of s. It thus
-needs no chart of the constraint manifold, which could be singular.
+A piece begins at the projection of its node onto the constraints, and continuity is required of all entries
+of s. No chart of the constraint manifold is needed, which could be singular.
 """
 
 import math
@@ -36,7 +36,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
 Ends = Int[np.ndarray, "ends"]
-NODE, LAST = "node of a piece", "time of the next node"  # keys in the start of a piece of a run
+NODE, LAST = "node of a piece", "time of the next node"  # keys in the start of a piece
 
 
 def begin(scene: Scene, start: dict, t0):
@@ -59,7 +59,7 @@ def ended(
     if LAST not in start:
         return {}
     last = jnp.argmin(jnp.abs(ts - start[LAST]))
-    # among the residuals, after all channels
+    # its residuals follow those of all channels
     return {"~end of a piece": jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}
 
 
@@ -74,7 +74,7 @@ class MultipleShooting:
     - `pieces`: number of pieces of each run; give either this or `duration`.
 
     Use it for motions that are unstable or chaotic over the whole run: over a piece, the problem is almost
-    linear. The objective and its minimum are the same without `shooting`. Pieces begin at samples; if a
+    linear. The objective and its minimum are those of a fit without `shooting`. Pieces begin at samples; if a
     sensor has a delay, they overlap by its largest possible value.
 
     **Raises** ValueError unless either a positive finite duration or at least two pieces are given. `fit`
@@ -104,8 +104,8 @@ class MultipleShooting:
 
 
 def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
-    """Return the samples at which pieces begin, and the last sample. Raises ValueError if there are fewer
-    intervals than pieces, or if an event ended the run.
+    """Return the indices of the samples at which pieces begin, and of the last sample. Raises ValueError if
+    there are fewer intervals than pieces, or if an event ended the run.
     """
     if run.ended_by:
         raise ValueError(
@@ -139,7 +139,7 @@ def numbers_of_filters(run: Experiment) -> int:
 
 
 def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
-    """Return, for each channel, the first sample of each piece, and the number of samples.
+    """Return for each channel the index of the first sample of each piece, and the number of samples.
 
     A sample at a node belongs to the later piece. With a delayed sensor, a sample belongs to a later piece
     only if that piece began at least the largest delay before the sample.
@@ -153,8 +153,8 @@ def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
 
 
 def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
-    """Return the pieces of a `checked` run. Each but the first begins at a node of `states` numbers; `ends`:
-    their first and last samples.
+    """Return the pieces of a `checked` run. All but the first begin at a node of `states` numbers. `ends`:
+    first and last samples of the pieces.
     """
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
@@ -183,8 +183,8 @@ def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
 
 
 def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
-    """Return the inputs with only the samples around this span. Actuators keep all samples, since their
-    unknown delays move them.
+    """Return the inputs with only the samples around this span. Commands of actuators keep all samples, since
+    an unknown delay shifts them.
     """
     if not isinstance(run.inputs, Inputs):
         return run.inputs

@@ -7,17 +7,17 @@
    ds_i = L_i d + g_i. Steps are full unless residuals change much.
 
 With step 2, all 20 first guesses of a chaotic double pendulum lead to the minimum; without it, 17, 16 and 8
-do (5, 10, 20 s of `bench/identification.py`). A fit has converged if a step changes residuals by at most
-`tolerance` in all, no unknown by more than that fraction, and pieces join to the simulation's tolerance.
+do (5, 10, 20 s of `bench/identification.py`). A fit has converged if a step changes the vector of residuals
+by at most `tolerance` and no unknown by more than that fraction, and pieces join to the tolerance of the
+simulation.
 
 Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P.
 Schlöder, GAMM-Mitteilungen 30 (2007) 376.
 
 First guesses of nodes: a measured coordinate or speed, and the rate of a measured coordinate, come from a
-parabola through the nearest samples. Speeds change as little as possible to satisfy qdot = N(q) u + nu.
-Quantities without a channel keep their value at the start. Coordinates on which no geometric constraint
-depends accumulate their changes along the pieces. Readings are corrected for delay, and for lag by y + lag
-y'.
+parabola through the nearest samples. Speeds change as little as possible to satisfy qdot = N(q) u + nu. Other
+quantities keep their value at the start, except that coordinates on which no geometric constraint depends
+accumulate their changes over the pieces. Readings are corrected for delay, and for lag by y + lag y'.
 """
 
 from dataclasses import replace
@@ -53,7 +53,7 @@ def first_nodes(
     q: Float[np.ndarray, "coordinates"],
     u: Float[np.ndarray, "speeds"],
 ) -> Float[np.ndarray, "pieces states"]:
-    """Return first guesses of the states at the beginning of all pieces of a run; q, u: its start."""
+    """Return first guesses of the states at the beginning of all pieces of a run. q, u: start of the run."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
@@ -94,7 +94,7 @@ def goes_on(scene: Scene, q: Float[np.ndarray, "coordinates"]) -> np.ndarray:
     """Return the coordinates, such as headings and distances, on which no geometric constraint and no unit
     norm depends.
     """
-    beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # no slope vanishes by symmetry here
+    beside = q + 0.1 * np.sin(1.0 + np.arange(q.size))  # where no slope vanishes by symmetry
     return ~np.any(_closures(scene, beside) != 0, axis=0)
 
 
@@ -170,10 +170,10 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
         nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(
             changes[:, here[:-1, None], np.flatnonzero(still)], axis=1
         )
-    # a piece whose motion fails begins at the start of its run
+    # a piece whose motion fails begins in the start state of its run
     nodes = np.where(failed[..., None] & ~of_y, starts, nodes)
     local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
-    # sizes: the spread of numbers over nodes, and their change over a piece
+    # sizes of states: their spread over the nodes, and their change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
     sizes = np.maximum(sizes, 0.01 * largest(nodes, (0, 1)))
     least = np.where(
@@ -201,7 +201,7 @@ def _start(
 
 
 def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
-    """Set unknown start values of runs to measured values that lie within their bounds and have no prior."""
+    """Set unknown start values without a prior to measured values, if these lie within the bounds."""
     unknowns, scene = problem.unknowns, problem.scene
     low, high = unknowns.low, unknowns.high
     for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):
@@ -232,7 +232,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
     shares = np.ones(len(theta))
     way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta)), shares), "pieces that join")
-    far = 2.0 * np.sqrt(max(problem.samples, 1))  # a step changes residuals by two sigmas at most, rms
+    far = 2.0 * np.sqrt(max(problem.samples, 1))  # a step may change residuals by two sigmas (rms)
     for _ in range(control.most_steps):
         here, arrow, x = way.here()
         if not here.size:
@@ -262,7 +262,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
-    """Return the fraction of the largest singular value below which singular values count as zero. The
-    fraction is smaller if the largest value grows along the motion and the others do not.
+    """Return the fraction of the largest singular value below which singular values count as zero. It is
+    smaller if the motion amplifies small changes, since this increases only the largest singular value.
     """
     return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

@@ -1,9 +1,9 @@
 """Ties: parameters that depend on others in a fit, such as two equal wheels.
 
-    p = f(scene)      f: plain JAX, of the scene with the unknowns and the parameters tied before
+p = f(scene)      f: plain JAX, of the scene with the unknowns and all previously tied parameters
 
-A function is traced when it is passed. Ties are compared by their computation, so that a new lambda in every
-call is the same tie.
+A function is traced when it is passed. Ties are compared by their operations, so that a new lambda in
+every call is the same tie.
 """
 
 from collections.abc import Callable
@@ -26,13 +26,13 @@ class Tie:
     function: Call
 
     def value(self, leaves: list) -> Array:
-        """Return the parameter of a scene with these leaves."""
+        """Return the tied parameter of a scene with these leaves."""
         return self.function.results(*leaves)[0]
 
 
 def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
-    """Return a parameter as a function of the scene, which has the first guesses. Raises ValueError unless
-    the function returns an allowed value.
+    """Return the tie of a parameter by a function of the scene. Raises ValueError unless the function returns
+    an allowed value at the first guesses in `scene`.
     """
     leaves, treedef = jax.tree.flatten(scene)
     expected = jnp.shape(getattr(scene, name))

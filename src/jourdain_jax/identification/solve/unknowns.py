@@ -3,8 +3,8 @@ sensors and actuators.
 
     theta = (shared, own of run 0, own of run 1, ...)
 
-Every run has a place for each initial value that is unknown in any run; a known value is held. If there is
-only one run, all its unknowns count as shared.
+Every run has a place for each initial value that is unknown in any run; where the value is known, it is held.
+The unknowns of a single run count as shared.
 
 `check_starts` checks that runs start on the constraints, also after changes of the unknowns.
 """
@@ -48,18 +48,18 @@ class Unknowns:
     layout: Layout
     runs: int
     guess: Places
-    fixed: Bool[np.ndarray, "places"]  # known values, present so that all runs have one shape
+    fixed: Bool[np.ndarray, "places"]  # known values, included so that all runs have the same shape
     ranges: tuple[Range, ...]
     labels: Labels  # of unknowns that are not fixed
     units: Labels
     prior_mean: Places  # zero without prior
     prior_weight: Places  # W; zero without prior
-    # M, for priors of shared unknowns: see `estimate.whitening`
+    # M of priors of shared unknowns: see `estimate.whitening`
     whitening: Float[np.ndarray, "shared shared"]
     estimated: np.ndarray = field(init=False)  # places of unknowns that are not fixed
     low: Places = field(init=False)
     high: Places = field(init=False)
-    least: Places = field(init=False)  # typical magnitude of each, used near zero
+    least: Places = field(init=False)  # typical magnitude of each place, used near zero
 
     def __post_init__(self):
         self.estimated = np.flatnonzero(~self.fixed)
@@ -86,7 +86,9 @@ class Unknowns:
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
-        """Return the first guess, and others on a Latin hypercube over the ranges; the same on every call."""
+        """Return the first guess, and others on a Latin hypercube over the ranges. Every call returns the
+        same guesses.
+        """
         theta = np.tile(self.guess, (count, 1))
         if count == 1:
             return theta
@@ -132,8 +134,8 @@ def unknowns_of(
     If `free` has a function of the scene for a parameter, this parameter depends on the unknowns (`ties`).
     The unknowns of a single run count as shared unless `apart`.
 
-    Raises ValueError for unknown names, guesses outside their bounds, a parameter with a value per run,
-    different estimates of a shared number, and a fit without unknowns.
+    Raises ValueError for unknown names, guesses outside their bounds, parameters with `per_run`, different
+    estimates of one shared number, and a fit without unknowns.
     """
     parameters = {name: about for name, _, about in parameters_of(scene)}
     shared: list[tuple[str, Kind, _Entry]] = []
@@ -220,21 +222,21 @@ def unknowns_of(
 
 
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
-    """Return the unknown with a range from zero, or from slightly above it if `positive`: below zero, the
-    scene has no motion. Raises ValueError for a negative guess.
+    """Return the unknown with a range that starts at zero, or slightly above zero if `positive`, since the
+    scene has no motion below. Raises ValueError for a negative guess.
     """
     if np.any(entry.guess < 0):
         raise ValueError(
             f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared non-negative; "
             "give zero or more"
         )
-    # fraction of the first guess: the bound of a positive parameter
+    # lower bound of a positive parameter, as a fraction of its first guess
     cut = entry.range.not_below(1e-6 * float(entry.guess.min()) if positive else 0.0)
     return replace(entry, range=cut)
 
 
 def _placed(parts: Iterable[tuple[str, Indices, Kind]]) -> tuple[Place, ...]:
-    """Return consecutive places."""
+    """Return the unknowns of `parts` at consecutive places."""
     found: list[Place] = []
     for name, shape, kind in parts:
         found.append(Place(name, shape, found[-1].end if found else 0, kind))
@@ -290,8 +292,8 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """Return an unknown from its description: an `Estimate`, a range, a prior or None. Raises ValueError for
-    an invalid first guess.
+    """Return an unknown from `given`: an `Estimate`, a range, a prior or None. Raises ValueError for an
+    invalid first guess.
     """
     guess, found, prior = value, default, None
     if isinstance(given, Estimate):
@@ -323,13 +325,13 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
 
 
 def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
-    """Raise ValueError unless the start of each run satisfies the constraints at the first guess, and still
-    does when the unknowns change.
+    """Raise ValueError unless the start of each run satisfies the constraints at the first guess and after
+    changes of the unknowns.
     """
     guess, layout = unknowns.guess, unknowns.layout
     change = (
         1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))
-    )  # by unequal amounts
+    )  # each unknown changes by another amount
     changes = "violates the constraints when the unknowns change: the values in `start` depend on each other"
     for index, run in enumerate(runs):
         for theta, why in ((guess, "is not admissible"), (guess + change, changes)):
