@@ -17,8 +17,8 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class Skate(Scene):
-    """A skate (knife edge) on an incline: the smallest nonholonomic system with a force, one constraint in
-    three coordinates.
+    """A skate (knife edge) on an incline, with one constraint in three coordinates: the smallest nonholonomic
+    system with a force.
 
         xdot sin(heading) - ydot cos(heading) = 0
         heading'' = 0,   v' = g sin(slope) cos(heading)                  (v: forward speed)
@@ -146,8 +146,8 @@ class Snakeboard(Scene):
     Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. Robotics and Automation
     (1994) 2391.
 
-    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels, the
-    back ones by -steer.
+    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels (the
+    back wheels steer by -steer).
 
     Inputs (N m): `rotor_torque` between rotor and board, `steer_torque` that opens both wheel pairs.
     """
@@ -171,7 +171,7 @@ class Snakeboard(Scene):
     def bodies(self, t, q):
         board = rot_z(q.heading)
         x, y, _ = self.half_length * board[:, 0]
-        nothing = jnp.zeros_like(self.mass)  # the masses of rotor and wheels are part of the board's
+        nothing = jnp.zeros_like(self.mass)  # the board's mass includes rotor and wheels
         return {
             "board": _level(self.mass, self.board_inertia, q.x, q.y, board),
             "rotor": _level(nothing, self.rotor_inertia, q.x, q.y, board @ rot_z(q.rotor)),
@@ -217,8 +217,8 @@ class TrailerChain(Scene):
     the car's mass centre: without torque the car's turn rate is constant. Source: J.-P. Laumond, Proc. IEEE
     Int. Conf. Intelligent Robots and Systems (1993) 1033; O. J. Sordalen, ICRA (1993) 1983.
 
-    Body 0 is the car, bodies 1 to n the trailers; mass centres on the axles. Trailer parameters: one number
-    or one each.
+    Body 0 is the car, bodies 1 to n are the trailers; mass centres are on the axles. A trailer parameter is
+    one number for all trailers, or one number for each.
 
     Inputs: `drive` forward on the car (N), `turn` torque on the car (N m).
     """
@@ -251,7 +251,7 @@ class TrailerChain(Scene):
 
     @property
     def domain(self):
-        """Return the domain: bodies in a line, at any heading."""
+        """Return the domain: bodies in a line along any heading."""
         behind = {f"x{i}": (-1.0 - 0.7 * i, 1.0 - 0.7 * i) for i in range(self.trailers + 1)}
         return behind | {f"heading{i}": (-3.2, 3.2) for i in range(self.trailers + 1)}
 

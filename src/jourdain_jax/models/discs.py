@@ -15,8 +15,8 @@ from jourdain_jax.scene.parameter_fields import parameter
 
 
 class VerticalDisc(Heavy):
-    """An upright disc that rolls and turns on a level plane: both rates are constant, the path is a circle or
-    a straight line.
+    """An upright disc that rolls and turns on a level plane. Both rates are constant, and the path is a
+    circle or a straight line.
 
         xdot = R cos(heading) rolldot,   ydot = R sin(heading) rolldot
 
@@ -74,7 +74,8 @@ class _ThinDisc(Heavy):
 
 
 class TiltingDisc(_ThinDisc):
-    """A thin disc rolling without slip on a level plane, in angles: the classic of Appell and Korteweg.
+    """A thin disc rolling without slip on a level plane, described by angles: the classic problem of Appell
+    and Korteweg.
 
     Contact and height are built into the coordinates (x, y: contact point). Two no-slip constraints, three
     degrees of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
@@ -108,8 +109,8 @@ _TILTED = TiltingDisc.example
 
 
 class TiltingDiscQuaternion(_ThinDisc):
-    """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the
-    contact as constraints.
+    """A thin disc rolling without slip on a level plane, described as a free body: position, quaternion, and
+    constraints for the contact.
 
     One height constraint and two no-slip constraints on six speeds leave three degrees of freedom, with the
     motion of `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc
@@ -142,6 +143,6 @@ class TiltingDiscQuaternion(_ThinDisc):
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        # 45 units of round-off of the squared angle to the ground (1e-7 rad in double precision): below, the
+        # below 45 units of round-off of the squared angle to the ground (1e-7 rad in double precision) the
         # contact point is undefined
         return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45.0 * jnp.finfo(axle.dtype).eps}

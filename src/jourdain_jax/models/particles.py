@@ -1,4 +1,4 @@
-"""Single particles with one constraint: sheets that bend paths, and a constraint that is nonlinear in the
+"""Single particles with one velocity constraint: two linear ones, and one that is nonlinear in the
 velocities.
 """
 
@@ -27,7 +27,7 @@ class _OnSheets(Scene):
         return {"particle": Particle(self.mass, jnp.stack([q.x, q.y, q.z]))}
 
     def _with_plane(self, normal) -> dict:
-        """Return shapes of the particle and of the plane of allowed velocities, given by its normal."""
+        """Return shapes to draw: the particle, and the plane of allowed velocities with this normal."""
         normal = normal / jnp.sqrt(normal @ normal)
         turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
         return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}
@@ -61,12 +61,12 @@ class RosenbergParticle(_OnSheets):
 
 
 class HeisenbergParticle(_OnSheets):
-    """The Heisenberg system: a free particle under the constraint `zdot = y xdot - x ydot` moves in straight
-    lines, free of force.
+    """The Heisenberg system: a particle with the constraint `zdot = y xdot - x ydot` and no forces. It moves
+    in straight lines.
 
-    The variational ("vakonomic") reading of the same constraint would give helices: the sharpest test of the
-    principle that an engine follows. Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section
-    1.8.
+    The variational ("vakonomic") principle with the same constraint would give helices, so that this system
+    tests which principle an engine follows. Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003),
+    section 1.8.
 
     The unit of length is chosen so that the constraint has no factor.
     """
@@ -87,14 +87,15 @@ class HeisenbergParticle(_OnSheets):
 
 
 class IsokineticParticle(Heavy):
-    """A particle kept at constant speed c under gravity: a constraint *nonlinear* in the velocities.
+    """A particle kept at constant speed c under gravity by a constraint that is *nonlinear* in the
+    velocities.
 
         (v.v - c^2)/(2 c) = 0,     A = v/c,     virtual velocities obey v.dv = 0
 
-    The multiplier is the force along the velocity, in N. It does no virtual power, but real power: energy is
-    not conserved. With `tau = g t/c` from level flight: sin(theta) = -tanh(tau), x = (c^2/g) gd(tau), z =
-    -(c^2/g) ln cosh(tau). Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983) 1016 (the
-    Gaussian isokinetic thermostat).
+    The multiplier is the force along the velocity, in N. Its virtual power is zero, but its real power is
+    not: energy is not conserved. With `tau = g t/c` from level flight: sin(theta) = -tanh(tau), x = (c^2/g)
+    gd(tau), z = -(c^2/g) ln cosh(tau). Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983)
+    1016 (the Gaussian isokinetic thermostat).
 
     Motion in a vertical plane, x horizontal and z up.
     """

@@ -1,5 +1,5 @@
-"""Pendulums of particles in a vertical plane: in angles, or in Cartesian coordinates with rods as geometric
-constraints.
+"""Pendulums of particles in a vertical plane, described by angles, or by Cartesian coordinates with rods as
+geometric constraints.
 """
 
 import equinox as eqx
@@ -37,8 +37,8 @@ class _DoublePendulum(Heavy):
 
 
 class DoublePendulumAngles(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, in the angles of the rods: no constraints,
-    two degrees of freedom.
+    """Planar double pendulum of two particles on massless rods, described by the angles of the rods: no
+    constraints, two degrees of freedom.
 
         (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2''
                            + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
@@ -69,13 +69,13 @@ def _along(angle) -> Vector3:
 
 
 class DoublePendulumRods(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, in Cartesian coordinates with the rods as
-    geometric constraints.
+    """Planar double pendulum of two particles on massless rods, described by Cartesian coordinates with the
+    rods as geometric constraints.
 
         |r1|^2 = l1^2,   |r2 - r1|^2 = l2^2
 
-    The same system as `DoublePendulumAngles`, which has no rods as constraints. Multipliers are the thrusts
-    in the rods, N (negative: tension).
+    The same system as `DoublePendulumAngles`, which has no constraints. Multipliers are the thrusts in the
+    rods, N (negative: tension).
 
     Cartesian coordinates of both particles; pivot at the origin.
     """
@@ -112,14 +112,15 @@ def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Partic
 
 
 class SpringAndRod(Scene):
-    """Two particles in a vertical plane: a spring ties the first to the origin, and a rod the second to the
+    """Two particles in a vertical plane. A spring connects the first to the origin, a rod the second to the
     first.
 
-    The spring is an impressed force, known from the positions. The rod is a constraint, whose force follows
-    from its condition `|r2 - r1| = l`. The rod's multiplier is its thrust (negative: tension), in N. Source:
-    Wang and Pao (2003), section I.
+    The force of the spring is impressed: it follows from the positions. The force of the rod follows from its
+    constraint `|r2 - r1| = l`; its multiplier is the thrust in the rod, N (negative: tension). Source: Wang
+    and Pao (2003), section I.
 
-    Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second.
+    Cartesian coordinates of both particles, in the order origin, spring (and damper), first particle, rod,
+    second particle.
     """
 
     mass1: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -165,7 +166,7 @@ class SpringAndRod(Scene):
 
 
 class PendulumChain(Heavy):
-    """A chain of particles joined by massless rods, hanging from a pivot in a vertical plane: n particles, n
+    """A chain of n particles joined by massless rods that hangs from a pivot in a vertical plane, with n
     geometric constraints.
 
         |r_i - r_{i-1}|^2 = l_i^2,   r_0 = 0
@@ -201,11 +202,11 @@ class PendulumChain(Heavy):
 
     @property
     def example(self):
-        """Return a straight chain at 60 degrees from hanging, at rest."""
+        """Return a straight chain at rest, 60 degrees from hanging."""
         return self.hanging([jnp.pi / 3] * self.links)
 
     def hanging(self, angles) -> dict[str, Scalar]:
-        """Return coordinates of the chain whose rods hang at these angles (rad) from straight down, positive
+        """Return coordinates of a chain whose rods have these angles (rad) from straight down, positive
         towards +x.
         """
         angles, lengths = jnp.asarray(angles), self._per_link(self.length)

@@ -66,7 +66,9 @@ def known_model(name: str) -> type[Scene]:
 
 
 def counts_of(kind: type[Scene]) -> Labels:
-    """Return names of the integers that determine the structure of a scene, such as a number of links."""
+    """Return names of the integer fields that determine the structure of a scene, such as a number of
+    links.
+    """
     return tuple(
         field.name
         for field in fields(kind)

@@ -17,10 +17,10 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class BallOnTurntable(Heavy):
-    """A ball that rolls on a turntable, flat or tilted: affine constraints, because the ground moves.
+    """A ball that rolls on a level or tilted turntable. Its constraints are affine, because the ground moves.
 
-    Its centre moves like a charge in a magnetic field: in a circle on the flat table, drifting *along* the
-    slope of the tilted one.
+    Its centre moves like a charge in a magnetic field: in a circle on a level table, and drifting *across*
+    the direction of steepest descent on a tilted one.
 
         R'' = n z x R' + g sin(tilt) x / (1 + kappa)
         n = Om kappa / (1 + kappa)                               (2/7 Om for a solid ball)
@@ -28,11 +28,11 @@ class BallOnTurntable(Heavy):
     R: the centre; z, x: unit vectors normal to the table and downhill; Om: turn rate of the table.
 
     The speeds are quasi-velocities: the rates of the centre and the angular velocity in the axes of the
-    table. In these the constraints are constant, and independent of the attitude, a quaternion needed only
-    for drawing. Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
+    table. With these the constraints have constant coefficients and do not depend on the attitude, a
+    quaternion needed only for drawing. Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
 
-    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the
-    table's axes.
+    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the axes
+    of the table.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -98,13 +98,13 @@ class BallOnTurntable(Heavy):
 
 
 class Rattleback(Heavy):
-    """The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned
-    against its own axes.
+    """The rattleback (celt): an ellipsoid that rolls without slip on a level plane, with principal axes of
+    inertia turned relative to the axes of the ellipsoid.
 
     Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the
     body is turned by gamma about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward
-    vertical in body axes. At the contact point the outward normal is mu. Its vector from the mass centre is
-    (h: depth of the mass centre below the ellipsoid's centre)
+    vertical in body axes. At the contact point the outward normal is mu. The vector from the mass centre to
+    this point is, with the depth h of the mass centre below the ellipsoid's centre,
 
         rho = S mu / sqrt(mu . S mu) - h e3,   S = diag(a^2, b^2, c^2)
 
@@ -161,8 +161,8 @@ class Rattleback(Heavy):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
 
     def contact_arm(self, down: Vector3) -> Vector3:
-        """Return rho (m), body axes: from the mass centre to the ellipsoid's lowest point if `down` is the
-        downward vertical.
+        """Return the vector rho (m) from the mass centre to the ellipsoid's lowest point, in body axes.
+        `down`: the downward vertical in body axes.
         """
         weighted = self._semi_axes() ** 2 * down
         return weighted / jnp.sqrt(down @ weighted) - self._below_centre()

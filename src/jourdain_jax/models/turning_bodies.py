@@ -11,7 +11,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class FreeRigidBody(Scene):
-    """A free rigid body: Euler's equations, solved by Jacobi's elliptic functions.
+    """A free rigid body. It obeys Euler's equations, which Jacobi's elliptic functions solve.
 
         I1 w1' = (I2 - I3) w2 w3   and cyclically;   r'' = 0
 
@@ -62,8 +62,8 @@ class Suslov(Scene):
     Source: G. K. Suslov, Theoretical Mechanics (1902); V. V. Kozlov, Regular and Chaotic Dynamics 7 (2002)
     161.
 
-    Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the
-    mass centre.
+    Attitude as a quaternion; speeds are the body angular velocity. Moments of inertia are about the fixed
+    point, which is the mass centre.
     """
 
     i11: Parameter = parameter(1.0, unit="kg m^2", positive=True)

@@ -1,4 +1,5 @@
-"""Two wheels on a rigid axle that roll down an incline: one system, four scenes, one per method of the paper.
+"""Two wheels on a rigid axle that roll down an incline: one system as four scenes, by the methods of the
+paper.
 
     Method I    `TwoWheelAxleFree`         two free bodies, 12 coordinates, ten constraints (61)
     Method II   `TwoWheelAxleCoordinates`  seven coordinates, the five constraints (65)
@@ -28,7 +29,7 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class _TwoWheelAxle(Scene):
-    """The common parts of the four scenes: parameters, a wheel, the weight, the known integrals."""
+    """The common parts of the four scenes: parameters, a wheel, weight, and known integrals."""
 
     radius: Parameter = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
     length: Parameter = parameter(0.8, unit="m", positive=True, about="l, of the axle")
@@ -90,7 +91,9 @@ class _TwoWheelAxle(Scene):
 
 
 class _FreeWheels(_TwoWheelAxle):
-    """Two upright wheels as free bodies, rolling with one heading, still without the axle's constraint."""
+    """Two upright wheels as free bodies that roll with one heading; subclasses add the constraint of the
+    axle.
+    """
 
     coordinates = coordinates("x1 y1 z1 phi1 theta1 psi1 x2 y2 z2 phi2 theta2 psi2")
     privileged = ("psi1_rate", "phi1_rate")
@@ -129,7 +132,7 @@ class TwoWheelAxleFree(_FreeWheels):
 class TwoWheelAxleRedundant(_FreeWheels):
     """Two wheels on an axle down an incline, Method I with both constraints (60a) and (60b).
 
-    Each alone fails to describe the axle where its factor, cos phi or sin phi, passes zero.
+    Either one alone does not describe the axle where its factor, cos phi or sin phi, is zero.
     """
 
     def velocity_constraints(self, motion):
@@ -174,7 +177,8 @@ class TwoWheelAxleCoordinates(_UprightWheels):
 class TwoWheelAxleQuasi(_UprightWheels):
     """Two wheels on an axle down an incline, Method III: quasi-velocities (67).
 
-    The constraints make five of the seven zero; the rolling of wheel 1 and the turning remain.
+    The constraints make five of the seven quasi-velocities zero; the rolling of wheel 1 and the turning
+    remain.
     """
 
     speeds = speeds("rolling turning")

@@ -38,9 +38,9 @@ class WhippleBicycle(Scene):
 
     x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
 
-    Inputs, both positive to the right (N m): `lean_torque` from outside on the rear frame about the level
-    line through the rear contact; `steer_torque` on the front frame about the steer axis, with its reaction
-    on the rear frame.
+    Inputs, both positive to the right (N m): `lean_torque`, an external torque on the rear frame about the
+    level line through the rear contact; `steer_torque` on the front frame about the steer axis, with its
+    reaction on the rear frame.
     """
 
     w: Parameter = parameter(1.02, unit="m", positive=True, about="wheelbase")
@@ -155,8 +155,8 @@ class WhippleBicycle(Scene):
         }
 
     def visuals(self, pose):
-        """Return shapes: bars from the hubs to the steer axis for frame and fork; the rider's mass centre as
-        a ball.
+        """Return shapes to draw: bars from the hubs to the steer axis for frame and fork, and a ball at the
+        rider's mass centre.
         """
         on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)
         head = on_axis(-2.1 * self.rF)
@@ -194,11 +194,11 @@ class WhippleBicycle(Scene):
         }
 
     def mode_names(self, eigenvalues: np.ndarray) -> Labels:
-        """Return names of the four modes; another number of modes has no names.
+        """Return the names of four modes; no names for another number of modes.
 
-        Weave is the complex pair. If all eigenvalues are real, it is the two with equal sign that merge at a
-        higher speed (when riding forward, the two that grow). Of the other two, castering is the faster mode
-        and capsize the slower.
+        Weave is the complex pair. If all eigenvalues are real, weave consists of the two with equal sign that
+        merge at a higher speed (when riding forward, the two that grow). Of the other two, castering is the
+        faster mode and capsize the slower.
         """
         if len(eigenvalues) != 4:
             return ()
@@ -207,7 +207,7 @@ class WhippleBicycle(Scene):
         return tuple("castering" if k == fast else "capsize" if k == slow else "weave" for k in range(4))
 
     def events(self, motion):
-        # leaning too far, or the handlebar beyond a right angle, where a real one hits the frame
+        # a lean that is too large, or a steer beyond a right angle, where a real handlebar hits the frame
         return {"fallen": jnp.minimum(1.2 - jnp.abs(motion.q.lean), jnp.pi / 2 - jnp.abs(motion.q.steer))}
 
 

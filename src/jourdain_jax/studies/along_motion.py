@@ -3,9 +3,9 @@
 Between saved times the quantity is a polynomial through nearby values. For the largest value, a polynomial p
 of degree four goes through the five values around the largest; a fine grid and one step of Newton's method
 for p'(s) = 0 locate its maximum. For the integral, a polynomial of degree three goes through the four values
-around each interval; Simpson's rule integrates it exactly. With time h between values, the maximum of a
-smooth quantity is accurate to the fifth order of h, and its integral to the fourth. Saved values alone would
-give the second order.
+around each interval; Simpson's rule integrates it exactly. With a time h between values, the error of the
+maximum of a smooth quantity is of order h^5, that of its integral of order h^4. With saved values alone both
+would be of order h^2.
 """
 
 import dataclasses
@@ -56,8 +56,8 @@ def sampled(
 
 
 def largest(times: Values, values: Values, count: Count) -> Scalar:
-    """Return the largest of the first `count` of `values`, also between them. Its derivative is the
-    quantity's at the time of the maximum.
+    """Return the maximum of the quantity over the first `count` of `values` and between them. Its derivative
+    is that of the quantity at the time of the maximum.
     """
     k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
     if times.shape[0] < FOR_EXTREMES:
@@ -95,8 +95,8 @@ def integral(times: Values, values: Values, count: Count) -> Scalar:
 
 
 def _window(times, values, count, first, zero, points: int):
-    """Return the index of the first of `points` neighbouring values (`first` if possible), their times since
-    `zero` in units of the window, and the values.
+    """Return the index of the first of `points` neighbouring values (`first` if possible), their times
+    relative to `zero` in units of the window, and the values.
 
     If there are fewer values than `points`, artificial times avoid a division by zero.
     """

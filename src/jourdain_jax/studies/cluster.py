@@ -1,8 +1,8 @@
 """Workers of a Dask cluster that compute the chunks of one study. All workers and the calling process must
 reach the study's folder.
 
-Dask restarts a chunk whose worker died. A chunk on which workers died repeatedly is tried once more alone,
-then omitted with a warning.
+Dask restarts a chunk whose worker died. If workers die repeatedly on a chunk, it is tried once more alone,
+and then omitted with a warning.
 """
 
 import os
@@ -16,8 +16,8 @@ from jourdain_jax.studies.workers import chunk, computed, keep_to_share, sent_to
 
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
-    """Return the workers of `run`. Raises ValueError if `client` is no Dask client, or if the task cannot be
-    sent to another process.
+    """Return the `workers` argument of `run.run` for a cluster. Raises ValueError if `client` is no Dask
+    client, or if the task cannot be sent to another process.
     """
     distributed = needed("distributed", "a cluster", "cluster")
     check_kind(client, distributed.Client, "`client`", "a `dask.distributed.Client`")
@@ -26,10 +26,10 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     def workers(
         store: Store, numbers: list[int], interrupted: Callable[[], bool]
     ) -> Iterator[tuple[int, int]]:
-        # a task instead of scattered data: the scheduler can recreate it when a worker dies
+        # a task instead of scattered data: the scheduler can recreate it if a worker dies
         study = client.submit(bytes, sent, pure=False)
         asked = study, str(store.path.resolve()), os.getpid(), _places(distributed, client)
-        # chunks per worker thread: one running, one queued
+        # two chunks per worker thread: one running, one queued
         most = 2 * max(1, sum(client.nthreads().values()))
         pool = client.get_executor(pure=False)
 
@@ -54,10 +54,10 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
-    """Compute and store a chunk in this worker. `asking`: the process that requests the chunk; `places`:
-    result of `_places`.
+    """Compute and store a chunk in this worker. `asking`: id of the process that requests the chunk;
+    `places`: the result of `_places`.
     """
-    # a separate worker process uses only its share of the cores
+    # a worker in a separate process uses only its share of the cores
     if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:
         from distributed import get_worker
 

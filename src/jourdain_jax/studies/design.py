@@ -1,9 +1,9 @@
 """The samples of a study: values of the varying quantities, for any range of sample indices.
 
 Correlated normal distributions: with independent standard normal z = Phi^-1(u) and the Cholesky factor L of
-the correlation matrix, L z has that correlation. The probability u of a quantity becomes Phi(L z), which its
-distribution maps to a value. Any distributions can thus have a correlation of ranks; for normal ones it is
-the stated correlation.
+the correlation matrix, L z has that correlation. Phi(L z) replaces the probability u of a quantity, and its
+distribution maps this to a value. So any distributions can have correlated ranks; normal distributions have
+the stated correlation itself.
 """
 
 import math
@@ -34,10 +34,10 @@ class Design(Printed):
       grid, or a column of a table (one number per sample). All must be of one kind.
     - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); not for grids and
       tables.
-    - `samples`: their number; a grid has all combinations of its levels, a table one sample per row. `seed`:
-      sample k depends only on the seed and k (in a Latin hypercube also on the number of samples).
-    - `correlation`: pair of names -> correlation coefficient, for normal distributions; for others, of the
-      normal scores of their ranks.
+    - `samples`: number of samples. A grid has all combinations of its levels, a table one sample per row.
+      `seed`: sample k depends only on the seed and k (in a Latin hypercube also on the number of samples).
+    - `correlation`: pair of names -> correlation coefficient of two normal distributions; of other
+      distributions, the correlation of the normal scores of their ranks.
 
         vary = {"mass": jj.studies.Normal(12.0, 0.3), "radius": jj.studies.Uniform(0.3, 0.4)}
         design = jj.studies.Design(vary, sampler="sobol", samples=1024, seed=7)
@@ -197,8 +197,8 @@ class Design(Printed):
     def _at(self, index, on_device: bool = False) -> dict:
         """Return the values of samples with these indices, in order.
 
-        Values drawn `on_device` are JAX arrays with the same bits as on the host. Grids and tables draw
-        nothing.
+        Values drawn `on_device` are JAX arrays with the same bits as on the host. Grids and tables stay on
+        the host.
         """
         if self.sampler == TABLE:
             return {name: column[index] for name, column in self.variables.items()}

@@ -1,7 +1,7 @@
 """Variation of a parameter or a start value over the samples of a study: distributions, and levels of a grid.
 
-A distribution maps uniform numbers u in (0, 1) to values by its inverse distribution function. So a sampler
-that spreads u well (Latin hypercube, Sobol) spreads the values well.
+A distribution maps uniform numbers u in (0, 1) to values by its inverse distribution function. A sampler that
+spreads u evenly (Latin hypercube, Sobol) therefore spreads the values well.
 """
 
 from abc import abstractmethod
@@ -45,7 +45,7 @@ class Distribution:
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
         """Return derivatives of `values(u)` with respect to the numbers of the distribution, by name. They
-        are imaginary parts (complex step), exact to round-off.
+        are computed by complex steps, exact to round-off.
         """
         known, tiny = vars(self), 1e-30
         return {

@@ -1,14 +1,14 @@
 """Gradients of the means of a study's outputs, by the pathwise derivative.
 
-Sample k consists of probabilities u_k, from which the distributions, with numbers theta, give its varying
-quantities x_k(theta). The u_k do not depend on theta. With the output f as a function of x,
+Sample k consists of probabilities u_k. The distributions, with numbers theta, map these to the varying
+quantities x_k(theta), while u_k does not depend on theta. With the output f as a function of x,
 
     d mean / d theta = (1 / n) sum_k  df/dx (x_k)  dx_k / d theta
 
 where df/dx is the exact derivative of the sample's motion, in forward mode. This is the derivative of the
-mean if f is continuous. f may jump where the end of a motion changes, for example from an event to none. The
-derivative then lacks the contribution of the jumps, and a warning says so. Outputs that depend only on the
-event that happened have no pathwise derivative.
+mean if f is continuous. f may jump where the kind of end of a motion changes, for example from an event to
+the end of the span. The derivative then lacks the contribution of the jumps, and a warning reports it.
+Outputs that depend only on the event that happened have no pathwise derivative.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from jourdain_jax.studies.distributions import Distribution
 from jourdain_jax.studies.outputs import OfEvent
 from jourdain_jax.studies.task import Task
 
-SHIFT = "shift"  # of all values of a table column, or of all levels of a grid
+SHIFT = "shift"  # a common shift of all values of a table column, or of all levels of a grid
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,8 +44,8 @@ class MeanGradients(Printed):
     - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the
       output over the unit of the number. Standard errors assume independent samples (a Sobol sequence or a
       Latin hypercube has smaller ones). NaN where the derivative does not exist.
-    - `lanes`: the number of samples of each output; `failed`: the number of failed motions, which are
-      omitted; `warnings`: reasons to doubt the numbers.
+    - `lanes`: the number of samples with a value of each output; `failed`: the number of failed motions,
+      which are omitted; `warnings`: reasons to doubt the numbers.
     """
 
     outputs: Labels
@@ -80,8 +80,8 @@ class MeanGradients(Printed):
 
 
 def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
-    """Return the gradients of the means of all outputs of a task, also with respect to the parameters
-    `shared` by all samples.
+    """Return the gradients of the means of all outputs of a task. `shared`: names of parameters, equal in all
+    samples, with respect to which to differentiate as well.
     """
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
@@ -149,8 +149,8 @@ def _of_block(task: Task, columns: Sequence[str]):
 
 
 def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[tuple[str, str, np.ndarray]]:
-    """Return the numbers with respect to which means are differentiated: column, name, and dx/dtheta
-    (samples,) of the column.
+    """Return the numbers theta with respect to which means are differentiated, each as the name of its
+    column, its own name, and dx/dtheta (samples,) of the column.
     """
     u, even = task.design.probabilities(first, last), np.ones(last - first)
     found = []

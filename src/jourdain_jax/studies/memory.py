@@ -1,12 +1,12 @@
-"""Bounds on a study: the disk of its folder, and the memory of its processes, by sizes of blocks and chunks.
+"""Bounds on the disk space and the memory of a study, which determine the sizes of blocks and chunks.
 
 The memory that a process needs is estimated before it compiles anything, and checked after every block:
 
     resident now + COMPILED + BLOCKS (bytes of a block's saved states) + CHUNKS (bytes of a chunk's arrays)
 
 Block sizes are chosen to satisfy the bound, and a study stops if its process exceeds it. The glibc allocator
-keeps freed arrays for reuse, and grows by hundreds of megabytes as sizes change. Under a bound, large arrays
-are therefore returned to the system at once, which costs a tenth of the time of studies that keep
+keeps freed arrays for reuse, which takes hundreds of megabytes as sizes change. Under a bound, large arrays
+are therefore returned to the system at once; this takes a tenth of the time of studies that store
 trajectories.
 """
 
@@ -44,17 +44,17 @@ def give_back_at_once() -> None:
 
 
 def of_each(memory: int, processes: int) -> int:
-    """Return the bytes for each computing process. `memory` is shared by all of them and, if there are
-    several, by this process.
+    """Return the bytes for each computing process. All of them share `memory`, and if there are several, this
+    process has a share, too.
     """
     return memory if processes == 1 else max(0, (memory - resident()) // processes)
 
 
 def room(allowed: int, *, here: bool) -> float:
-    """Return the bytes for blocks and chunks in a process that may use `allowed` bytes: this process
-    (`here`), or a new one. Raises ValueError if none remain.
+    """Return the bytes that remain for blocks and chunks in a process that may use `allowed` bytes. `here`:
+    whether it is this process, or a new one. Raises ValueError if none remain.
     """
-    # bytes of a process with this package before it computes
+    # bytes of a new process that has imported this package
     held = resident() if here else 240e6
     give_back_at_once()
     if allowed < held + COMPILED:

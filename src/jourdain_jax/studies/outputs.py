@@ -22,8 +22,8 @@ from jourdain_jax.studies.along_motion import integral, largest, sampled
 
 
 class Output:
-    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times`: whether the number
-    depends on saved times, or only on the end.
+    """Base of the outputs. `of(motion)` returns the number, `unit` is its unit; `over_times`: whether the
+    number depends on all saved times, or only on the end.
     """
 
     unit: str = ""
@@ -69,8 +69,8 @@ class _Along(Output):
     function of a trajectory that returns its values at all times, such as `lambda motion:
     jnp.hypot(motion["x"], motion["y"])`.
 
-    Between saved times the quantity is a polynomial. For a smooth quantity saved every h seconds, extremes
-    are accurate to the fifth order of h, integrals to the fourth.
+    Between saved times the quantity is a polynomial. For a smooth quantity saved every h seconds, the error
+    of extremes is of order h^5, that of integrals of order h^4.
     """
 
     quantity: str | Callable
@@ -86,13 +86,13 @@ class _Along(Output):
     @staticmethod
     @abstractmethod
     def _number(times, values, count) -> Scalar:
-        """Return the number, from the first `count` values of the quantity at these times."""
+        """Return the number for the first `count` values of the quantity at these times."""
 
 
 @dataclass(frozen=True)
 class Largest(_Along):
-    """The largest value of a `quantity` at the saved times, between them, and at the end. `unit`: a text
-    stored with it.
+    """The largest value of a `quantity` along the motion, also between saved times. `unit`: a text stored
+    with it.
 
     `quantity`: the name of a coordinate or speed, or a function of a trajectory that returns its values at
     all times.
@@ -132,7 +132,7 @@ class Integral(_Along):
 
 @dataclass(frozen=True)
 class OfEvent(Output):
-    """A number of the stop event named `event`, or of any event for None."""
+    """Base of outputs about the stop event named `event`, or about any stop event for None."""
 
     event: str | None = None
     over_times = False
@@ -169,8 +169,8 @@ class EventTime(OfEvent):
 
 @dataclass(frozen=True)
 class Happened(OfEvent):
-    """1 if the stop event `event` (default: any event) ended the motion, otherwise 0. Its mean is the
-    fraction of such samples.
+    """1 if the stop event `event` (default: any event) ended the motion, otherwise 0. The mean is the
+    fraction of samples that ended so.
     """
 
     def of(self, motion: Trajectory) -> Scalar:
@@ -211,7 +211,7 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
         )
     found = {}
     for name, output in outputs.items():
-        # it becomes the name of a folder
+        # the name of an output becomes the name of a folder
         printable = isinstance(name, str) and name.isprintable() and len(name.encode()) <= 200
         if not printable or not re.fullmatch(r"[^/\\_.][^/\\]*", name):
             raise ValueError(

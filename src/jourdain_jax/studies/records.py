@@ -1,5 +1,5 @@
-"""Records of a study on disk, with checksums: the receipt of each finished chunk, and the manifest, which
-holds the digests of files that are written once.
+"""Records of a study on disk, with checksums: a receipt for each finished chunk, and the manifest with
+digests of all files that are written once.
 """
 
 import hashlib
@@ -35,8 +35,8 @@ class Receipt:
         return self.last - self.first, self.tally.failed.size
 
     def packed(self) -> bytes:
-        """Return the receipt as bytes: a first line, a line of JSON that describes the arrays, the arrays,
-        and the CRC-32C of all these.
+        """Return the receipt as bytes: a header line, a line of JSON that describes the arrays, the arrays,
+        and the CRC-32C of all that.
         """
         arrays = vars(self.tally) | {"cells": self.tally.cells.astype(np.int32)}
         listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
@@ -48,8 +48,8 @@ class Receipt:
 
     @staticmethod
     def unpacked(content: bytes, outputs: int) -> "Receipt":
-        """Return the receipt in these bytes, for a study with this number of `outputs`. Raises ValueError, or
-        another error of the reader, for damaged bytes.
+        """Return the receipt in the bytes `content`, for a study with this number of `outputs`. Damaged bytes
+        raise ValueError or another error.
         """
         if not content.startswith(_BEGIN) or content != with_checksum(content[:-4]):
             raise ValueError("the receipt of a chunk is incomplete")

@@ -27,7 +27,9 @@ LEVELS = (0.025, 0.5, 0.975)
 
 @dataclass(frozen=True, repr=False)
 class Lane(Printed):
-    """One sample of a study: the data to repeat it, and its stored results."""
+    """One sample of a study: its parameters and start, from which it can be simulated again, and its stored
+    results.
+    """
 
     task: Task
     number: int
@@ -58,8 +60,8 @@ class StudyResult(Printed):
     """Results of a study, read from its folder.
 
     `store.path` is the folder; `xarray.open_zarr` also opens it. Statistics cover the finished chunks;
-    `complete`: whether all are finished. `left_out`: indices of chunks whose receipt is damaged or belongs to
-    another study. They do not count, and `study.run` computes them again.
+    `complete`: whether all are finished. `left_out`: indices of chunks that are omitted, because their
+    receipt is damaged or belongs to another study. `study.run` computes these again.
     """
 
     def __init__(self, store: Store, task: Task | None = None):
@@ -89,7 +91,9 @@ class StudyResult(Printed):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return the number of samples per result code, by its name, without unused codes."""
+        """Return the number of samples with each result code, by the name of the code; codes without samples
+        are omitted.
+        """
         return {name: int(count) for name, count in zip(CODES, self._tally.codes, strict=True) if count}
 
     @property
@@ -125,7 +129,7 @@ class StudyResult(Printed):
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Return means, covariances, histograms and extremes of outputs, over the samples that have them."""
+        """Return means, covariances, histograms and extremes of outputs, over the samples with a value."""
         grid = self.store.read_grid()
         if grid is None or not self._done:
             raise ValueError(
@@ -165,7 +169,7 @@ class StudyResult(Printed):
         first, last = (inside[0], inside[-1] + 1) if inside.size else (0, len(counts))
         step = max(1, math.ceil((last - first) / cells))
         starts = np.arange(first, last, step)
-        # the last cell is as wide as the others, unless it holds values beyond the grid
+        # the last cell is as wide as the others, unless it contains values beyond the grid
         end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
@@ -200,7 +204,7 @@ class StudyResult(Printed):
         """Return all arrays as an `xarray.Dataset` with names and units, read on use. Unfinished samples are
         NaN and have the result -1.
 
-        Raises ValueError for damaged arrays; all arrays are read once here for this check.
+        Raises ValueError for damaged arrays; this check reads all arrays once.
         """
         self.store.check_arrays(self.store.receipts())
         return self._opened()
@@ -266,7 +270,7 @@ class StudyResult(Printed):
         )
 
     def _in_short(self, output: str, level: float) -> str:
-        """Return a quantile as one number, the middle of its cell; beyond the grid, as a bound."""
+        """Return the text of a quantile: the middle of its cell, or a bound if it lies beyond the grid."""
         (low, high), grid, i = self.quantile(output, level), self.statistics.grid, self._place(output)
         beyond = (">", low) if low >= grid.high[i] else ("<", high) if high <= grid.low[i] else None
         return f"{beyond[0]} {beyond[1]:.5g}" if beyond and low < high else f"{(low + high) / 2:.5g}"
@@ -286,7 +290,7 @@ class StudyResult(Printed):
             some = ", ".join(map(str, self.failed[:10]))
             lines.append(f"  failed: samples {some}{' ...' if self.failed.size > 10 else ''}")
         if tally.again[0]:
-            lines.append(f"  {tally.again[0]} were run again in another way")
+            lines.append(f"  {tally.again[0]} were run again by another method")
         if done:
             lines.append(
                 f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} "
@@ -308,10 +312,10 @@ class StudyResult(Printed):
 
 
 def load_study(path: FilePath) -> StudyResult:
-    """Return the results of a study in the folder `path`, finished or not, without its scene. `study.run`
-    with the same arguments also offers `.lane(k).simulate()`.
+    """Return the results of a study in the folder `path`, finished or not, without its scene. For
+    `.lane(k).simulate()`, call `study.run` with the same arguments instead.
 
-    A warning names damaged chunks, whose samples do not count (`left_out`). Raises ValueError if the folder
+    A warning names damaged chunks, whose samples are omitted (`left_out`). Raises ValueError if the folder
     holds no study, a study of an unknown format, or one with a damaged description.
     """
     found = StudyResult(Store(path))
@@ -328,8 +332,8 @@ def merge_studies(path: FilePath, shares: Sequence[FilePath]) -> StudyResult:
     """Copy chunks from the folders `shares` of one study (`study.run(..., shard=(k, n))`) into the folder
     `path`, which is one of them.
 
-    Damaged chunks are omitted; `study.run` then computes the missing ones. Raises ValueError if a folder
-    holds another study.
+    Damaged chunks are not copied; `study.run` then computes the missing ones. Raises ValueError if a folder
+    contains another study.
     """
     target = Store(path)
     with target.lock():

@@ -1,18 +1,18 @@
-"""Functions of doubles with identical bits in NumPy on the host and in JAX on a device: one source, with
-every operation rounded separately.
+"""Functions of doubles whose results have the same bits in NumPy on the host and in JAX on a device. Both run
+the same source, with every operation rounded separately.
 
 Sums, quotients and roots are rounded identically everywhere. On some machines, however, compilers fuse a
 product and a sum into one operation with one rounding; `product` prevents this. The normal distribution and
 its inverse are from Cephes, as in SciPy. The exponential and the logarithm are from fdlibm, with errors of at
-most one unit in the last place. One pair of polynomials serves each tail of the inverse (accurate to 3e-15
-for u > 1e-16, to 1e-13 for u > 1e-22).
+most one unit in the last place. The inverse uses one pair of polynomials in each tail (accurate to 3e-15 for
+u > 1e-16, to 1e-13 for u > 1e-22).
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-# in two parts; the first times an integer is exact
+# log 2 in two parts; the product of the first and an integer is exact
 _LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LOG = (
     1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01, 2.222219843214978396e-01,
@@ -72,7 +72,7 @@ def library(x):
 
 
 def apart(x, u):
-    """Return x unchanged, but so that a compiler cannot fuse it with other operations.
+    """Return x unchanged, in a form that a compiler cannot fuse with other operations.
 
     `u`: a positive argument of the program. Its sign bit, unknown to the compiler, is combined with x.
     """
@@ -137,7 +137,8 @@ def normal_probability(x, u):
 
 
 def correlated(factor, u):
-    """Return probabilities of correlated numbers from those of independent ones, (samples, variables).
+    """Return probabilities of correlated quantities from probabilities of independent ones, (samples,
+    variables).
 
     Normal numbers with these probabilities are multiplied by the rows of `factor` in sequence, since a matrix
     product may round differently.
@@ -160,8 +161,8 @@ def _outer_quantile(y, u):
 
 
 def normal_quantile(u):
-    """Return the value below which a standard normal number lies with probability u, 0 < u < 1. u must be an
-    argument of the program.
+    """Return the value below which a standard normal number lies with probability u, 0 < u < 1. In a compiled
+    program, u must be an argument.
     """
     xp = library(u)
     upper = u > 1.0 - _TAIL
@@ -172,7 +173,7 @@ def normal_quantile(u):
     middle, outer = (d + product(d, dd * top / bottom, u)) * _ROOT, y <= _TAIL
     if isinstance(u, jax.Array):
         tail = _outer_quantile(jnp.minimum(y, _TAIL), u)
-    else:  # only for the few in the tails
+    else:  # the tails have few entries
         tail = np.zeros_like(u)
         tail[outer] = _outer_quantile(y[outer], y[outer])
     return xp.where(outer, xp.where(upper, tail, -tail), middle)

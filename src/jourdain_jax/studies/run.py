@@ -1,5 +1,5 @@
-"""Running a study: computes and stores the missing chunks in sequence, with a progress bar, and handles
-interruptions.
+"""Computation and storage of the missing chunks of a study in sequence, with a progress bar and handling of
+Ctrl-C.
 
 The first Ctrl-C finishes the current chunk, the second stops at once. The same call continues after both.
 """
@@ -41,7 +41,7 @@ class Lanes:
     """Results of a block of samples: the stored values by column, the ends of motions by the names of
     `OF_LANES`, and all outputs (samples, outputs).
 
-    The last two are on the device, and may be padded.
+    Ends and outputs are on the device, and may be padded.
     """
 
     lanes: range
@@ -53,8 +53,8 @@ class Lanes:
 class Runner:
     """Computation and storage of chunks of one task in this process.
 
-    Every process first computes the first block: it determines the grid of the statistics, and its compiled
-    programs serve all others.
+    Every process first computes the first block, which determines the grid of the statistics. Its compiled
+    programs are used for all other blocks.
     """
 
     def __init__(self, task: Task, store: Store):
@@ -137,8 +137,8 @@ def _rows(array, index):
 def bounded(
     task: Task, path, chunk: int | None, allowed: int | None, *, here: bool
 ) -> tuple[Task, int | None]:
-    """Return the task, and the number of samples of its chunks. Blocks have the size used in the folder or,
-    in a new folder, a size that keeps a process below `allowed` bytes.
+    """Return the task with its block size, and the number of samples of its chunks. Blocks have the size used
+    in the folder or, in a new folder, a size that keeps a process below `allowed` bytes.
 
     `here`: whether this process computes. Raises ValueError if blocks or chunks need more.
     """
@@ -194,8 +194,8 @@ def _constants(task: Task) -> dict[str, tuple]:
 
 
 def _chunk(task: Task, chunk: int | None) -> int:
-    """Return the number of samples of a chunk: whole blocks and whole strides of saved samples, by default
-    about a thousandth of all samples.
+    """Return the number of samples of a chunk: a multiple of the block size and of the interval of stored
+    trajectories, by default about a thousandth of all samples.
     """
     unit = np.lcm(task.block, task.stride)
     if chunk is None:
@@ -255,8 +255,8 @@ def attributes(task: Task) -> dict:
 
 
 def _as_text(x) -> object:
-    """Return an option as text; numbers stay numbers. Memory addresses of functions, different in every
-    process, are omitted.
+    """Return an option as text, but numbers as numbers. Memory addresses, which differ between processes, are
+    omitted.
     """
     if isinstance(x, int | float | np.ndarray | jax.Array):
         return np.asarray(x).tolist()
@@ -339,8 +339,8 @@ def run(
 ) -> Store:
     """Compute the missing part of a task in the folder `path`.
 
-    `shard`: (k, n), the chunks whose index is k - 1 modulo n; `workers`: (store, numbers, interrupted) ->
-    numbers of samples and of failed samples, chunk by chunk.
+    `shard`: (k, n) selects the chunks whose index is k - 1 modulo n. `workers(store, numbers, interrupted)`
+    yields the numbers of samples and of failed samples of each chunk.
     """
     if not Store.is_taken(path):
         memory.check_disk(path, len(task.design) / shard[1] * task.bytes_of_kept_lane)
@@ -367,7 +367,7 @@ def run(
                 bar.update(lanes)
                 bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
             stopped = interrupted() and finished < len(missing)
-        if not stopped and store.read_grid() is None:  # damaged, or of a share without a chunk
+        if not stopped and store.read_grid() is None:  # damaged, or the share has no chunk
             Runner(task, store)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"

@@ -3,9 +3,9 @@
     random           words of the counter-based generator Philox 4x64 (Salmon et al. 2011), with counter k
     latin-hypercube  one sample in each of N strata of each variable (McKay, Beckman and Conover 1979):
                      u = (pi(k) + v) / N. The permutation pi is a Feistel network of mixed words on the next
-                     power of four, walked until it is below N (Black and Rogaway 2002), without tables
+                     power of four, repeated until its value is below N (Black and Rogaway 2002)
     sobol            Sobol's sequence with Owen's linear scrambling and a digital shift, from scipy.stats.qmc,
-                     half a cell from the edge
+                     moved by half a cell off the edge
     saltelli         for Sobol' indices of d variables: points (A_j, B_j) of that sequence in 2 d dimensions;
                      samples j (d + 2) + i are A_j, then A_j with the entry of one variable from B_j, for
                      each variable, then B_j (Saltelli et al. 2010)
@@ -32,7 +32,9 @@ _STEPS = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
 
 
 def _mixed(x):
-    """Return x with mixed bits, each depending on all bits of x (splitmix64; Steele, Lea and Flood 2014)."""
+    """Return a hash of x in which each bit depends on all bits of x (splitmix64; Steele, Lea and
+    Flood 2014).
+    """
     x = (x ^ (x >> np.uint64(30))) * _M1
     x = (x ^ (x >> np.uint64(27))) * _M2
     return x ^ (x >> np.uint64(31))
@@ -49,8 +51,8 @@ def _philox(counter, key: int):
 
 
 def random(seed: int, index, variables: int, samples: int):
-    """Return independent samples with these indices, shape (len(index), variables): the middles of 2^53
-    cells.
+    """Return independent samples with these indices, shape (len(index), variables). They are midpoints of
+    2^53 cells.
     """
     groups = -(-variables // 4)  # one counter gives four words
     if isinstance(index, jax.Array):
@@ -92,7 +94,7 @@ def permuted(seed: int, number: int, index, count: int):
 
 
 def latin_hypercube(seed: int, index, variables: int, samples: int):
-    """Return the samples with these indices of a hypercube with `samples` strata, shape (len(index),
+    """Return the samples with these indices of a Latin hypercube with `samples` strata, shape (len(index),
     variables).
     """
     strata = library(index).stack(
@@ -105,8 +107,8 @@ def latin_hypercube(seed: int, index, variables: int, samples: int):
 
 @lru_cache(maxsize=16)
 def _directions(seed: int, variables: int, bits: int) -> np.ndarray:
-    """Return the words of a scrambled Sobol sequence: the word of its first point, and the words added by the
-    bits of the Gray code of k.
+    """Return the words of a scrambled Sobol sequence: the word of its first point, and the word that each bit
+    of the Gray code of k adds.
     """
     engine = qmc.Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
     points = []

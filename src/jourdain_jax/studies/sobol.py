@@ -6,9 +6,9 @@ al. 2010):
     S_i  = mean_j f(B_j) (f(AB_j^i) - f(A_j)) / V    first order: reduction of V if i is fixed (table 2, b)
     ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)     total: remainder if all others are fixed (2, f; Jansen)
 
-V is the variance over all A_j and B_j; f is taken relative to its mean, which reduces the errors. Intervals:
-standard errors from groups of samples drawn again with replacement (Efron's bootstrap), times the normal
-quantile of the confidence.
+V is the variance over all A_j and B_j. The mean of f is subtracted first, which reduces the errors.
+Half-widths of intervals are standard errors, from groups of samples drawn again with replacement (Efron's
+bootstrap), times the normal quantile of the confidence.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Running statistics of a study's outputs, with bits independent of the chunks and their order.
+"""Running statistics of a study's outputs, whose bits do not depend on the chunks and their order.
 
-JAX counts samples on their device, in doubles, and only sums and histograms reach the host. Sums are taken
-block by block (a block: some thousand samples with fixed indices), about a centre c near the mean. With m_i =
-1 where output i is finite and x_i = 0 where it is not, a block gives
+The device computes sums and histograms, in doubles, and only these reach the host. There is one sum for each
+block of some thousand samples with fixed indices, relative to a centre c near the mean. With m_i = 1 where
+output i is finite and x_i = 0 where it is not, a block gives
 
     N_ij = sum m_i m_j,   A_ij = sum (x_i - c_i) m_j,   S_ij = sum (x_i - c_i)(x_j - c_j)
 
@@ -11,8 +11,8 @@ Then, over the samples with both outputs,
 
     mean_i = c_i + A_ii / N_ii,    cov_ij = (S_ij - A_ij A_ji / N_ij) / (N_ij - 1)
 
-Histograms count in cells of a fixed grid, twice the range of the first block; samples beyond it are counted
-below and above. A quantile is known to its cell; the smallest and largest values are exact.
+Histograms have a fixed grid of cells over twice the range of the first block, and count samples below and
+above this range. A quantile is known up to its cell; the smallest and largest values are exact.
 """
 
 import math
@@ -30,8 +30,8 @@ CELLS = 4096
 
 @dataclass(frozen=True)
 class Grid:
-    """The grid of the histograms: `CELLS` equal cells from `low` to `high`, and the `centre` of sums, for
-    every output.
+    """The grid of the histograms of all outputs: `CELLS` equal cells from `low` to `high`, and the `centre`
+    of sums.
     """
 
     low: np.ndarray
@@ -78,21 +78,23 @@ class Grid:
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts and sums of some samples, apart from their columns; the arrays of a receipt."""
+    """Counts and sums over some samples: the arrays of a receipt."""
 
-    codes: np.ndarray  # samples per result code
-    again: np.ndarray  # (1,): samples that were run again
-    steps: np.ndarray  # (2,): accepted and rejected
-    failed: np.ndarray  # indices of samples
+    codes: np.ndarray  # number of samples per result code
+    again: np.ndarray  # (1,): number of samples that were run again
+    steps: np.ndarray  # (2,): accepted and rejected steps
+    failed: np.ndarray  # indices of failed samples
     sums: np.ndarray  # (blocks, 3, outputs, outputs): N, A and S of each block
-    # (2, cells): nonempty cells among (outputs, CELLS + 2), and their counts; the first and last cell of each
-    # output are those below and above the grid
+    # (2, cells): indices of nonempty cells in (outputs, CELLS + 2), and their counts; the first and last cell
+    # of each output are below and above the grid
     cells: np.ndarray
     extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite if there is none
 
     @classmethod
     def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
-        """Return the tally of the first `lanes` of a block, from results and values (samples, outputs)."""
+        """Return the tally of the first `lanes` samples of a block, from their ends and values (samples,
+        outputs).
+        """
         with jax.enable_x64(True):
             counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
         failed = np.zeros(0, np.int64)
@@ -103,7 +105,7 @@ class Tally:
 
     @classmethod
     def together(cls, several: Iterable["Tally"], outputs: int) -> "Tally":
-        """Return the combined tally of `several`, for this number of outputs."""
+        """Return the combined tally of `several` tallies, for this number of outputs."""
         known = list(several)
         counts = np.zeros((outputs, CELLS + 2), np.int64)
         for one in known:
@@ -122,7 +124,7 @@ class Tally:
 
     @classmethod
     def checked(cls, arrays: Mapping[str, np.ndarray], lanes: range, outputs: int) -> "Tally":
-        """Return the tally in these arrays of some `lanes`. Raises ValueError for numbers out of range."""
+        """Return the tally of some `lanes` in these arrays. Raises ValueError for numbers out of range."""
         codes, again, steps, failed, sums, (place, counts), extremes = (
             arrays[name] for name in cls.__dataclass_fields__
         )
@@ -147,8 +149,8 @@ class Tally:
 
 @jax.jit
 def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
-    """Return the fields of a tally of the first `lanes` samples, without `failed`; `cells`: samples in all
-    cells.
+    """Return the fields of a tally of the first `lanes` samples, without `failed`; `cells` has the number of
+    samples in every cell.
     """
     counts = jnp.arange(len(values)) < lanes
     values, finite = values.astype(float), jnp.isfinite(values) & counts[:, None]
@@ -161,7 +163,7 @@ def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
         "steps": jnp.stack(
             [jnp.sum(jnp.where(counts, ends[name], 0), dtype=int) for name in ("steps", "rejected_steps")]
         ),
-        # not by a matrix product, whose rounding may depend on threads
+        # a matrix product may round differently, depending on threads
         "sums": jnp.stack([jnp.sum(a[:, :, None] * b[:, None], axis=0) for a, b in ((m, m), (x, m), (x, x))])[
             None
         ],
@@ -181,11 +183,11 @@ def _sparse(counts: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of all outputs over the samples that have them."""
+    """Statistics of all outputs over the samples with a value."""
 
     names: tuple[str, ...]
     grid: Grid
-    lanes: np.ndarray  # (outputs, outputs): samples with both
+    lanes: np.ndarray  # (outputs, outputs): number of samples with both outputs
     mean: np.ndarray  # (outputs,)
     covariance: np.ndarray  # (outputs, outputs)
     extremes: np.ndarray  # (2, outputs)

@@ -1,5 +1,5 @@
-"""A study on disk: a Zarr group (format 3) with one array per quantity along the axis `lane` of samples, and
-files for continuing after an interruption.
+"""A study on disk: a Zarr group (format 3) with one array per quantity, whose first axis `lane` runs over the
+samples, and files for continuing after an interruption.
 
     NAME/zarr.json, NAME/c/0, ...   arrays, cut into chunks; each ends in its CRC-32C (Zarr's codec `crc32c`)
     run/study.json      identity of the study: format, digests, settings, versions; written once
@@ -11,7 +11,7 @@ files for continuing after an interruption.
 A chunk is finished if its receipt is intact, belongs to this study and grid, and matches the checksums of its
 arrays. Otherwise it is computed again. Files that are not in the manifest count as missing. The grid is
 written before the manifest that lists it. Processes that compute the grid at the same time write the same
-numbers. Where the numbers of two machines differ, chunks of a replaced grid do not count.
+numbers. If two machines compute different grids, chunks that belong to the replaced grid are computed again.
 """
 
 import contextlib
@@ -50,8 +50,8 @@ MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
 
 @dataclass(frozen=True)
 class Column:
-    """One array of a study: its type, its axes after the first (name, length), its value for missing entries,
-    and its attributes. `every`: the interval of stored samples.
+    """One array of a study: its type, its axes after the first as (name, length), its value for missing
+    entries, and its attributes. `every`: the interval of stored samples.
     """
 
     dtype: str
@@ -74,7 +74,7 @@ class Store:
             for name, entry in self.study["columns"].items()
         }
         self.outputs = tuple(self.study.get("outputs", ()))
-        # equal in all shares
+        # these entries are equal in all shares
         own = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]
         self.identity = digest(json.dumps(own).encode())
 
@@ -86,7 +86,7 @@ class Store:
         constants: Mapping[str, tuple],
         attributes: Mapping,
     ) -> "Store":
-        """Create a folder, completely or not at all; an existing one is not changed. `constants`: name ->
+        """Create the folder, completely or not at all; an existing one is not changed. `constants`: name ->
         axis, values, attributes.
         """
         zarr = needed("zarr", "storing a study", "studies")
@@ -217,7 +217,7 @@ class Store:
 
     @staticmethod
     def is_taken(path: FilePath) -> bool:
-        """Return whether something is at `path`; an empty folder does not count."""
+        """Return whether `path` exists and is not an empty folder."""
         path = name_of(path)
         return os.path.exists(path) and not (os.path.isdir(path) and not os.listdir(path))
 
@@ -252,7 +252,7 @@ class Store:
 
     @contextlib.contextmanager
     def _named(self) -> Iterator[None]:
-        """Return a context in which errors of the system also describe the state of the study."""
+        """Return a context that adds the state of the study to errors of the operating system."""
         try:
             yield
         except OSError as error:
@@ -301,7 +301,7 @@ class Store:
             return None
 
     def receipts(self) -> list[int]:
-        """Return indices of chunks that have a receipt, intact or not, in order."""
+        """Return the indices of chunks that have a receipt, intact or not, in order."""
         try:
             names = os.listdir(self.path / "run" / "chunks")
         except OSError as error:
@@ -316,12 +316,12 @@ class Store:
         )
 
     def is_whole(self, number: int) -> bool:
-        """Return whether a chunk has its receipt and all its arrays, unchanged."""
+        """Return whether the receipt and all arrays of a chunk exist and are unchanged."""
         return self._wrong(number) is None
 
     def _wrong(self, number: int) -> str | None:
-        """Return the name of an array of a chunk whose file differs in length or checksum from its receipt;
-        None if there is none.
+        """Return the name of an array of a chunk whose file has another length or checksum than its receipt
+        states; None if there is none.
         """
         receipt = self.receipt(number)
         for name, column in self.columns.items():
@@ -387,7 +387,7 @@ class Store:
 
 
 def _beyond(study: Mapping) -> str:
-    """Return a sentence on the number of a study that is out of range; empty if there is none."""
+    """Return a sentence on a number of the study that is out of range; empty if there is none."""
     for name, most in {"samples": MOST_SAMPLES, "chunk": MOST_LANES, "block": MOST_LANES}.items():
         value = study.get(name)
         if type(value) is not int or not 1 <= value <= most:

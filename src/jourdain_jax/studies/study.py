@@ -49,10 +49,10 @@ class Study(Printed):
     """Many motions of one scene with varying parameters or start values.
 
     - `scene`; `vary`: parameter -> its variation; `start`: coordinate or speed -> its variation, or one
-      number for all samples (the rest is solved for, as by `jj.start`; default: the scene's example). A
-      variation is a distribution (`jj.studies.Normal`, `jj.studies.Uniform`, `jj.studies.LogNormal`,
-      `jj.studies.LogUniform`), `jj.studies.Levels` of a grid, or a list with one number per sample; all must
-      be of one kind.
+      number for all samples (other values follow from the constraints, as in `jj.start`; default: the scene's
+      example). A variation is a distribution (`jj.studies.Normal`, `jj.studies.Uniform`,
+      `jj.studies.LogNormal`, `jj.studies.LogUniform`), `jj.studies.Levels` of a grid, or a list with one
+      number per sample; all must be of one kind.
     - `sampler`, `samples`, `seed`, `correlation`: as in `jj.studies.Design`. Sample k depends only on the
       seed and k.
 
@@ -74,7 +74,7 @@ class Study(Printed):
     samples: int | None = None
     seed: int = 0
     correlation: Any = None
-    # the samples: parameters by name, start values by name with `_at_start`
+    # the samples: parameters by name, start values by name with the suffix `_at_start`
     design: Design = field(init=False, repr=False, compare=False)
     _given: Any = field(init=False, repr=False, compare=False)  # the scene, or its model
     _constants: dict = field(init=False, repr=False, compare=False)  # start values that do not vary
@@ -96,7 +96,7 @@ class Study(Printed):
         )
 
     def _named(self) -> tuple[dict, dict]:
-        """Return the varying quantities by the names of their columns, and the constant start values."""
+        """Return the varying quantities, by the names of their columns, and the constant start values."""
         examples = {
             "vary": '{"mass": jj.studies.Normal(12.0, 0.3)}',
             "start": '{"lean": 0.3}',
@@ -152,8 +152,8 @@ class Study(Printed):
         options=None,
         **by_name,
     ) -> Task:
-        """Return a description of everything that determines the results of a run. Arguments as in `run`:
-        `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`, `by_name`.
+        """Return a description of everything that determines the results of a run. The arguments are those of
+        `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`, `by_name`.
         """
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
@@ -196,8 +196,8 @@ class Study(Printed):
         """Compute the missing part of the study in the folder `path`, which is created if necessary, and
         return its results.
 
-        The same call on the same folder continues an earlier one, however that ended. Results are bit-equal
-        for all `chunk` sizes, orders and interruptions.
+        The same call on the same folder continues an earlier run, however that ended. Results have the same
+        bits for all `chunk` sizes, orders and interruptions.
 
         - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) at which outputs
           are evaluated (default: 201 equidistant ones; only the end if all outputs use only the end).
@@ -207,25 +207,25 @@ class Study(Printed):
           speeds. They are NaN for failed motions.
         - `save`: "outputs" stores parameters, starts, outputs, result code and steps of every sample;
           "statistics" stores only counts, sums and histograms.
-        - `keep_every`: 1000 also stores the states at `ts` of every thousandth sample; with save="statistics"
-          also its other results. 1: of all samples; None: of none.
+        - `keep_every`: an interval of samples. 1000 stores the states at `ts` of every thousandth sample, and
+          with save="statistics" also its other results; 1 those of all samples, None those of no sample.
         - `chunk`: number of samples stored together (default: about a thousandth of all); after a crash at
           most one chunk is computed again.
         - `processes`: the number of computing processes, each with its share of the cores. If there are
           several, guard the top level of your script by `if __name__ == "__main__":`, and define outputs
           outside of functions.
-        - `client`: a `dask.distributed.Client`. Each of its workers computes one chunk at a time, and must
-          reach the folder.
-        - `shard`: (k, n): only the k-th of n shares of the chunks, into a separate folder on each of n
-          machines; `jj.studies.merge_studies` combines them.
+        - `client`: a `dask.distributed.Client`. Each of its workers computes one chunk at a time and must
+          have access to the folder.
+        - `shard`: (k, n) computes only the k-th of n shares of the chunks. Use a separate folder on each of n
+          machines, and combine them by `jj.studies.merge_studies`.
         - `progress`: show a bar; `command`: text stored with the study.
         - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to
-          `keep_every` above, are the `what` of the signature.
+          `keep_every` above, are `what` in the signature.
 
         If the scene is a model, `jj.build(scene, memory="2GB")`, its memory bounds all computing processes of
         this machine together, including the present one; with `client`, it bounds each worker. Blocks and
-        chunks are sized accordingly. The bound is enforced on Linux. Means and covariances of studies with
-        other block sizes differ in their last digits.
+        chunks are sized accordingly, and on Linux the bound is enforced. Block sizes affect the last digits
+        of means and covariances.
 
         Raises ValueError if the folder holds another study, or if its disk or the memory is too small. A
         sample takes 8 bytes per stored number; there are at most 2^44 samples by default. Raises MemoryError
@@ -258,9 +258,9 @@ class Study(Printed):
         """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
         and to shared `parameters`.
 
-        They are pathwise derivatives: the mean over samples of exact derivatives of their motions, in forward
+        They are pathwise derivatives: means of the exact derivatives of the samples' motions, in forward
         mode. If samples end at events, a `SensitivityWarning` (also in `warnings` of the result) names the
-        missing part. This process computes them; nothing is stored.
+        missing part. The computation runs in this process, and nothing is stored.
 
         - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 

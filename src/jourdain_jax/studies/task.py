@@ -1,5 +1,5 @@
-"""The computation of a study: samples in blocks of a fixed size, each by one `rollout` and one compiled
-program of outputs.
+"""The computation of a study: blocks of a fixed number of samples, each computed by one `rollout` and one
+compiled program for the outputs.
 
 Block b of B samples holds samples b B to (b + 1) B - 1, independently of the chunks in which results are
 stored. The last block is padded with copies of its last sample. All blocks run the same compiled programs on
@@ -27,7 +27,7 @@ from jourdain_jax.studies.design import Design
 from jourdain_jax.studies.outputs import Output
 from jourdain_jax.studies.store import Column
 
-LARGEST_BLOCK = 2048  # samples: one slow sample hardly counts, and a chunk takes a fraction of a second
+LARGEST_BLOCK = 2048  # samples: one slow sample costs little, and a block takes a fraction of a second
 AT_START = "_at_start"  # suffix of columns of start values, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files next to the arrays
 SAVES = ("statistics", "outputs")
@@ -35,7 +35,7 @@ SAVES = ("statistics", "outputs")
 
 @dataclass(frozen=True)
 class Task:
-    """A study with everything that determines its numbers."""
+    """Everything that determines the numbers of a study."""
 
     scene: Scene
     design: Design  # parameters by name, start values by name and AT_START
@@ -45,7 +45,7 @@ class Task:
     options: AllOptions
     save: str
     keep_every: int | None  # interval of samples whose states at `ts` are stored; None: none
-    # samples; equal in all processes. A GPU takes some ten thousand at once
+    # samples of a block, equal in all processes; a GPU takes some ten thousand at once
     largest_block: int = field(
         default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17
     )
@@ -55,7 +55,7 @@ class Task:
     def block(self) -> int:
         """Return the number of samples of a block."""
         block = min(self.largest_block, max(8, 1 << (len(self.design) - 1).bit_length()))
-        # limit on bytes of a block's saved states
+        # limit on the bytes of saved states of a block
         while block > 8 and block * self.bytes_of_lane > (2**26):
             block //= 2
         return block

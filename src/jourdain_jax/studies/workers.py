@@ -1,5 +1,5 @@
-"""Several processes that compute the chunks of one study. Each is a new process, not a fork of one in which
-JAX runs, and has its share of the cores.
+"""Several processes that compute the chunks of one study. Each is a new process, since a process in which JAX
+runs must not be forked, and has its share of the cores.
 
 If a worker dies, a new worker computes its unfinished chunks, one at a time. A chunk on which workers died
 three times is omitted, with a warning that names its samples.
@@ -27,12 +27,14 @@ _NONE_BEGAN = (
     "no worker of this study could start; see its printed error. Each imports the main program: run studies "
     "in it under `if __name__ == '__main__':`, and define scenes and outputs in a module; or take processes=1"
 )
-_runners: dict[tuple, Runner] = {}  # of this process: for the latest study and folder
+_runners: dict[tuple, Runner] = {}  # the runner of this process for the latest study and folder
 _one_at_a_time = threading.Lock()
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
-    """Return the workers of `run`. Raises ValueError if the task cannot be sent to another process."""
+    """Return the `workers` argument of `run.run` for `count` processes. Raises ValueError if the task cannot
+    be sent to another process.
+    """
     sent = sent_to_others(task)
 
     def workers(
@@ -58,8 +60,8 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
 
 def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
-    """Compute and store a chunk, one at a time in this process, and return its counts. Chunks that a process
-    stored before it died are not computed again.
+    """Compute and store a chunk in this process, which computes one chunk at a time, and return its counts.
+    Chunks that a process stored before it died are not computed again.
     """
     with _one_at_a_time:
         which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
@@ -74,12 +76,13 @@ def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
 def whatever_dies(
     store: Store, numbers, interrupted, compute: Callable, attempts: int
 ) -> Iterator[tuple[int, int]]:
-    """Yield the counts of the chunks `numbers`, computed even if processes die. Chunks on which they die
+    """Yield the counts of the chunks `numbers`, even if some processes die. Chunks on which processes die
     repeatedly are omitted with a warning.
 
     - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed samples of each
       chunk. It returns the indices of unfinished chunks if a process died.
-    - `attempts`: how often each unfinished chunk is tried alone, to exclude other chunks as the cause.
+    - `attempts`: number of times that each unfinished chunk is tried alone, to exclude other chunks as the
+      cause.
 
     A process may die within a motion if a user's function calls other code, or if memory runs out. Raises
     RuntimeError if this happens in the first block, which every process computes.
@@ -114,7 +117,7 @@ def _died(store: Store, numbers: list[int]) -> str:
 
 
 def sent_to_others(task: Task) -> bytes:
-    """Return the task as bytes for another process. Raises ValueError if it cannot be sent."""
+    """Return the task as bytes for another process. Raises ValueError if it cannot be pickled."""
     try:
         return pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -145,11 +148,11 @@ def computed(
         ):
             try:
                 running[submit(number)] = number
-            except deadly:  # a pool with a dead process
+            except deadly:  # the pool has a dead process
                 died.append(number)
         if not running:
             receipts = {number: store.receipt(number) for number in died}
-            # stored before the process died
+            # chunks stored before the process died
             yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)
             return [number for number, receipt in receipts.items() if receipt is None]
         for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -187,6 +190,8 @@ def keep_to_share(place: int, count: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent, a handle of the operating system, ends or has ended."""
+    """End this process when its parent process, given as a handle of the operating system, ends or
+    has ended.
+    """
     connection.wait([parent])
     os._exit(1)
