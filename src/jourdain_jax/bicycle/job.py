@@ -1,8 +1,8 @@
 """The study of measured bicycles: from parameter files to stability speeds with their uncertainty, and
 simulated rides.
 
-For each file, the nonlinear Whipple bicycle is built and linearised. Its weave, capsize and double-root
-speeds have 2.5 and 97.5 % limits, by Monte Carlo from the measured standard deviations. Hands-free rides are
+For each file, the nonlinear Whipple bicycle is built and linearised. A Monte Carlo with the measured standard
+deviations gives 2.5 and 97.5 % limits of its weave, capsize and double-root speeds. Hands-free rides are
 simulated below, inside and above the stable range.
 """
 
@@ -27,7 +27,7 @@ from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.rollout import Rollout, rollout
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
-MAX_SPEED = 50.0  # m/s; higher speeds count as none
+MAX_SPEED = 50.0  # m/s; higher speeds are treated as nonexistent
 CAVEAT = (
     "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is the share "
     "of these samples.\nSigmas of parameter files count as independent, since these contain no covariance; "
@@ -38,7 +38,7 @@ CAVEAT = (
 
 @dataclass(frozen=True)
 class Refused:
-    """A file that describes no possible bicycle, and the reason."""
+    """The result for a file that describes no possible bicycle, with the reason."""
 
     path: str
     error: str
@@ -50,7 +50,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Rides:
-    """Three rides, by label."""
+    """Three simulated rides with labels."""
 
     labels: tuple[str, ...]
     speeds: np.ndarray  # m/s
@@ -66,9 +66,9 @@ class Study:
     speeds: dict[str, dict | None]  # name -> value, low, high, fraction
     stable_fraction: float  # share of the samples with a stable range
     grid: np.ndarray  # forward speeds of the eigenvalues, m/s
-    # (samples + 1, speeds, modes), first the measured bicycle; castering, capsize, weave, weave
+    # (samples + 1, speeds, modes): first the measured bicycle; modes: castering, capsize, weave, weave
     eigenvalues: np.ndarray
-    physical: np.ndarray  # marks of the samples that are possible bicycles
+    physical: np.ndarray  # whether each sample is a possible bicycle
     rides: Rides
 
     def as_dict(self) -> dict:
@@ -108,7 +108,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     drawn = sample_parameters(bicycle, jax.random.key(seed), samples)
     nominal = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     physical = np.asarray(drawn.physical)
-    # an impossible sample is computed with the measured values, and not counted
+    # an impossible sample is replaced by the measured values and not counted
     values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
@@ -128,10 +128,12 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Return speeds (m/s) by label: below, inside and above the stable range; fixed speeds without one."""
+    """Return label -> speed (m/s): below, inside and above the stable range, or fixed speeds if there is
+    none.
+    """
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
-    if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on
+    if not np.isfinite(capsize) or capsize <= weave:  # stable at all speeds above the weave speed
         return {
             "below the stable range": 0.75 * weave,
             "inside it, near its start": 1.2 * weave,
@@ -160,7 +162,7 @@ def _speeds_and_matrices(row):
     return stability_speeds(*matrices, max_speed=MAX_SPEED), matrices
 
 
-# 2,000 samples: compiled in 6 s instead of 18, run in 3.4 s instead of 2.0
+# for 2,000 samples this compiles in 6 s instead of 18, and runs in 3.4 s instead of 2.0
 _speeds = compiled_quickly(jax.vmap(_speeds_and_matrices))
 
 
@@ -168,7 +170,7 @@ _modes = jax.jit(jax.vmap(lambda matrices, grid: eigenvalues(*matrices, speeds=g
 
 
 def _interval(values, physical) -> dict | None:
-    """Return value, low, high and fraction of one speed; None if no bicycle or sample has it."""
+    """Return value, low, high and fraction of one speed; None if neither the bicycle nor a sample has it."""
     if np.isnan(values).all():
         return None
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))

@@ -9,11 +9,11 @@
                                T = 2 pi sqrt((n . I n) / k)
 
 m, I: mass and inertia of the part; l: distance of its mass centre from the axle; T: period; k: stiffness of
-the rod; n: its direction in axes of the part. The mass centre of a hung part lies below the rod. More
-hangings or plumb lines than unknowns are fitted by least squares. Readings are independent, but parameters
-from shared readings are not: all inertias share the stiffness of the rod, and the inertia about y depends on
-the mass centre. Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control
-of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
+the rod; n: direction of the rod in axes of the part. The mass centre of a hung part lies below the rod. If
+there are more hangings or plumb lines than unknowns, they are fitted by least squares. Readings are
+independent, but parameters that depend on the same readings are correlated: all inertias depend on the
+stiffness of the rod, and the inertia about y on the mass centre. Source: J. D. G. Kooijman, M.Sc. thesis,
+Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
 import os
@@ -44,13 +44,13 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
 
     Derivatives of the parameters with respect to the readings are exact; covariances are of first order in
     the sigmas of the readings (see the module docstring). A mass centre is the point with the least sum of
-    squared distances from the plumb lines through it. The published values are means over all pairs of lines,
-    with the same weight for nearly parallel lines.
+    squared distances from its plumb lines. (The published values are means over the intersections of all
+    pairs of lines, where nearly parallel lines have the same weight.)
 
-    **Arguments:** `path`, of a file of readings (`readings.py` lists its content), or the name of a shipped
-    one (`shipped_measurements`). **Returns:** a `MeasuredBicycle`, with a warning for plumb lines that miss
-    the mass centre by more than their sigmas allow. **Raises** ValueError for an unreadable or incomplete
-    file, an unknown name, and readings that no bicycle can have.
+    **Arguments:** `path`, the path of a file of readings (`readings.py` describes its format), or the name of
+    a shipped one (`shipped_measurements`). **Returns:** a `MeasuredBicycle`, with a warning for plumb lines
+    that miss the mass centre by more than their sigmas allow. **Raises** ValueError for an unreadable or
+    incomplete file, an unknown name, and readings that no bicycle can have.
     """
     if isinstance(path, str) and not os.path.exists(path) and not Path(path).suffix:
         known = shipped_measurements()
@@ -92,10 +92,10 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> Sen
         here = [i for i, name in enumerate(names) if name.startswith(f"miss {part}")]
         distance = [abs(float(found[names[i]])) for i in here]
         sigma = np.sqrt(np.sum(misses[here] ** 2, axis=1))
-        exact = np.where(np.array(distance) > 1e-12, np.inf, 0.0)  # ratios for zero sigmas
+        exact = np.where(np.array(distance) > 1e-12, np.inf, 0.0)  # ratios if the sigmas are zero
         ratio = np.divide(distance, sigma, out=exact, where=sigma > 0)
         worst = int(np.argmax(ratio))
-        if ratio[worst] > 3:  # standard deviations by which lines may miss a mass centre without a warning
+        if ratio[worst] > 3:  # lines may miss a mass centre by three standard deviations
             warnings.append(
                 f"upright lines through the hung part {part} miss its mass centre by up to "
                 f"{1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: these sigmas are too small, or a "
@@ -109,7 +109,7 @@ def _with_slopes(
     means: Values, hangings: tuple[tuple[str, Indices], ...], by_table: bool
 ) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
     """Return parameters, distances of plumb lines, and the derivatives of both with respect to each reading,
-    in the order of the means.
+    in the order of `means`.
     """
     # compiles in half the time of `jacfwd`
     found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)
@@ -117,8 +117,8 @@ def _with_slopes(
 
 
 def _parameters(y: Values, hangings: dict[str, Indices], by_table: bool) -> Values:
-    """Return all parameters of the benchmark, and the distances of plumb lines from the mass centres ("miss
-    B1").
+    """Return all parameters of the benchmark bicycle, and the distances of plumb lines from the mass centres
+    ("miss B1").
     """
     found = {"g": y["g"]} | {f"r{wheel}": y[f"d{wheel}"] / (2 * jnp.pi * y[f"n{wheel}"]) for wheel in "RF"}
     found |= {f"m{part}": y[f"m{part}"] for part in ("R", "F", *hangings)}
@@ -129,7 +129,7 @@ def _parameters(y: Values, hangings: dict[str, Indices], by_table: bool) -> Valu
         hung_by["G"] = front - _handlebar_to_axle(y, found["lam"])
     tilts = {}
     for part, numbers in hangings.items():
-        # with the steer axis as on the road, alpha is 90 degrees + lam
+        # if the bicycle stands on the road, alpha is 90 degrees + lam
         tilts[part] = jnp.deg2rad(_column("alpha", part, numbers, y)) - found["lam"] - jnp.pi / 2
         r, misses = _mass_centre(tilts[part], _column("a", part, numbers, y))
         found |= {f"{axis}{part}": at for axis, at in zip("xz", hung_by[part] + r, strict=True)}
@@ -177,11 +177,11 @@ def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
 
 def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2"], PerHanging]:
     """Return the vector (x, z) from the suspension point of a part to its mass centre, m, and the distances
-    of the rod's lines from that centre.
+    of the plumb lines from that centre.
 
         cos(tilt) x + sin(tilt) z = a
 
-    The vertical line of the rod passes at the distance a from the suspension point.
+    a: the distance of the rod's vertical line from the suspension point.
     """
     across = jnp.stack([jnp.cos(tilts), jnp.sin(tilts)], axis=1)
     r = _least_squares(across, beside)
@@ -205,8 +205,8 @@ def _moments_about_y(y: Values, lengths: Values) -> Values:
 
 
 def _moments_in_plane(y: Values, hangings: dict[str, Indices], tilts: dict[str, Float[Array, "_"]]) -> Values:
-    """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists; by
-    least squares for more than three.
+    """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists, by
+    least squares if a part has more than three periods.
 
     A bar of known inertia calibrates the rod. Wheels are fixed to it by their rims, parts along n = (-sin
     tilt, 0, cos tilt).

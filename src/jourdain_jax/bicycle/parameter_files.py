@@ -3,7 +3,7 @@ warnings.
 
 The format is that of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al.
 2007, `#` comments. YAML files, `name: value`, with or without a section `values`, are read as well. A missing
-sigma counts as zero. The files contain no covariance, so errors count as independent.
+sigma counts as zero. The files contain no covariance, so errors are taken as independent.
 """
 
 import re
@@ -38,13 +38,13 @@ class MeasuredBicycle:
     path: str
     without_sigma: Labels  # names without a sigma in the file
     ignored: Labels  # names in the file that the Whipple bicycle lacks
-    warnings: Labels  # sentences on odd values, which are used as they are
-    # in the order of `values`; None: unknown, and errors count as independent
+    warnings: Labels  # sentences on doubtful values, which are used unchanged
+    # covariance in the order of `values`; None: unknown, errors are taken as independent
     covariance: Float[np.ndarray, "parameters parameters"] | None = None
 
     @property
     def with_independent_errors(self) -> "MeasuredBicycle":
-        """Return the bicycle with independent errors of its parameters, without covariance."""
+        """Return the bicycle without the covariance of its parameters, whose errors are then independent."""
         return replace(self, covariance=None)
 
     @property
@@ -85,7 +85,7 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
 
 
 def shipped_bicycles() -> dict[str, Path]:
-    """Return the parameter files shipped with the package, name -> path; `Tms` is degenerate."""
+    """Return the parameter files shipped with the package, name -> path. `Tms` is no possible bicycle."""
     return _shipped("Benchmark")
 
 
@@ -93,8 +93,8 @@ def shipped_measurements() -> dict[str, Path]:
     """Return the files of raw measurements shipped with the package, name -> path, for
     `benchmark_from_measurements`.
 
-    The readings of `Silver` are of another bicycle's parts; `Gyro`, `Rigidcl` and `Stratos` have no published
-    parameters.
+    The readings of `Silver` belong to parts of another bicycle. `Gyro`, `Rigidcl` and `Stratos` have no
+    published parameters.
     """
     return _shipped("Measured")
 
@@ -107,15 +107,14 @@ def _shipped(ending: str) -> dict[str, Path]:
 
 
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
-    """Return the bicycle of one parameter file, read as text, or as YAML by the ending of `path`.
+    """Return the bicycle of one parameter file, read as YAML or as text, depending on the suffix of `path`.
 
         bicycle = read_bicycle(shipped_bicycles()["Browser"])
         bicycle.values["c"], bicycle.sigmas["c"]  # trail and its standard deviation, m
 
     **Raises** ValueError, with file, line and parameter, for an unreadable file, a malformed line, a value
-    that is not a finite number, and a negative sigma. Names must be known, complete and without repetition.
-    The bicycle must be possible: radii, masses, wheelbase and gravity are positive, moments of inertia not
-    negative.
+    that is not a finite number, a negative sigma, unknown, missing or repeated names, and an impossible
+    bicycle (radii, masses, wheelbase and gravity must be positive, moments of inertia not negative).
     """
     path = Path(files.name_of(path))
     text = read_lines(path)
@@ -165,7 +164,7 @@ def read_lines(path: Path) -> str:
 
 
 def text_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and content of the lines that hold a parameter, without comments."""
+    """Yield number and content, without comments, of the lines that contain a parameter."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()
         if content:
@@ -173,8 +172,8 @@ def text_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
-    """Yield numbers and content of the lines of a YAML file, in the format of a text file. The lines are
-    those of the section `values`, or all lines if there is no such section.
+    """Yield line numbers and contents of a YAML file, in the format of a text file: of the section `values`,
+    or of the whole file if there is no such section.
     """
     lines = [
         (number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)
@@ -205,8 +204,8 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
 def entries(
     path: Path, lines: Iterable[tuple[int, str]], form: str, again: str
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield the location, the name and the text after `=` of each line. Raises ValueError for another `form`
-    or a repeated name.
+    """Yield the location, the name and the text after `=` of each line. Raises ValueError for a line without
+    the `form` and for a repeated name.
     """
     given: dict[str, int] = {}
     for number, line in lines:
@@ -240,7 +239,7 @@ def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, floa
 
 
 def _check_known(name: str, where: str) -> None:
-    # bodies G and S together are H, and v does not describe the bicycle
+    # G and S are parts of H, and v is a speed
     if not re.fullmatch(r"v|I[RF]zz|y[BH]|m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)", name):
         check_name(name, PARAMETER_NAMES, f"{where}: unknown parameter `{shortened(name)}`")
 

@@ -24,11 +24,11 @@ PARAMETER_NAMES: Labels = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
-    """Return the conditions that possible bicycles satisfy, as sentences, and whether each value violates
-    them. NaN counts as a violation.
+    """Return the conditions on possible bicycles, and whether the values violate them. NaN counts as a
+    violation.
 
     **Arguments:** `values`: number, or array of samples of one common shape, for every name of
-    `PARAMETER_NAMES`. **Returns:** sentence -> True for values that violate it.
+    `PARAMETER_NAMES`. **Returns:** condition, as a sentence -> True for values that violate it.
     """
     broken = {}
     for name, known in PARAMETERS.items():
@@ -42,7 +42,7 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
 
 
 def doubts(values: Mapping[str, float]) -> Sentences:
-    """Return one sentence for each doubtful value of a bicycle that does not prevent a simulation.
+    """Return one sentence for each doubtful value of a bicycle. Doubtful values do not prevent a simulation.
 
     The inertia matrix of a body should be positive definite, and each principal moment of inertia at most the
     sum of the other two.

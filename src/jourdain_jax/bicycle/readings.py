@@ -20,7 +20,7 @@ of quantity, part and number: `TtB2` is the twisting period of the rear frame B,
 | `h6 h7 d5 d6 l` | suspension point of handlebar G relative to the front axle; only with G and S | m |
 | `g` | gravity | m/s^2 |
 
-The offset of the rod is from the middle of the wheel. A part has three hangings or more.
+The offset of the rod is measured from the middle of the wheel. Each part needs three or more hangings.
 """
 
 import math
@@ -61,7 +61,7 @@ class Readings:
 
 
 def holds_readings(path: Path) -> bool:
-    """Return whether a file is one of raw measurements, by its name."""
+    """Return whether the name of a file is that of a file of raw measurements."""
     return path.name.endswith("Measured.txt")
 
 
@@ -88,7 +88,7 @@ def read_readings(path: str | Path) -> Readings:
     ]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
     missing = [name for name in needed if name not in means]
-    for part, found in hangings.items():  # three, for three numbers in the plane of symmetry
+    for part, found in hangings.items():  # three unknowns in the plane of symmetry need three hangings
         missing += [f"{what}{part}{k + 1}" for k in range(len(found), 3) for what in ("alpha", "a", "Tt")]
     if missing:
         raise ValueError(
@@ -119,7 +119,7 @@ def read_readings(path: str | Path) -> Readings:
 
 
 def _hangings(means: dict[str, float], part: str) -> Indices:
-    """Return the hangings of a part with all three readings."""
+    """Return the numbers of the hangings of a part that have all three readings."""
     numbers = sorted(int(name[len(f"Tt{part}") :]) for name in means if re.fullmatch(rf"Tt{part}\d+", name))
     return tuple(k for k in numbers if f"alpha{part}{k}" in means and f"a{part}{k}" in means)
 

@@ -12,10 +12,11 @@ at roots of polynomials in x (omega^2 = b1/b3):
         D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
         D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
 
-All their positive roots are found, and refined by steps of Newton's method that carry derivatives. The second
-polynomial, H, is the product of all sums of two eigenvalues times b4^3 v. A pair crosses downwards where H'
-b3 > 0, and a real eigenvalue crosses zero upwards where b0' b1 < 0. Two that coincide become a pair where
-dp/dv and d2p/ds2 have equal signs. Coefficients are ordered from the highest power.
+All positive roots are found and refined by Newton's method, whose last steps also give derivatives. The
+second polynomial, H, is b4^3 v times the product of all sums of two eigenvalues. As v grows, the real part of
+a complex pair becomes negative where H' b3 > 0, a real eigenvalue becomes positive where b0' b1 < 0, and two
+equal eigenvalues become a complex pair where dp/dv and d2p/ds2 have equal signs. Coefficients are ordered
+from the highest power.
 
 M, C1, K0 and K2 come from the nonlinear model, linearised about upright straight running at rest and at one
 speed. The tests check that C is proportional to v, and that K is affine in v^2.
@@ -49,7 +50,7 @@ Polynomial = Float[Array, " coefficients"]
 
 
 class BicycleMatrices(NamedTuple):
-    """The linear bicycle; unpacks into the arguments below: `stability_speeds(*matrices)`."""
+    """The matrices of the linear bicycle, which unpack into arguments: `stability_speeds(*matrices)`."""
 
     M: Square  # kg m^2
     C1: Square  # kg m
@@ -59,22 +60,21 @@ class BicycleMatrices(NamedTuple):
 
 
 class StabilitySpeeds(eqx.Module):
-    """The speeds at which a bicycle's stability changes, m/s; NaN if there is none up to the largest speed.
-
-    Eigenvalues there: `jj.critical`, `eigenvalues`.
+    """The speeds at which a bicycle's stability changes, m/s; NaN for a speed that does not exist up to the
+    largest speed examined. For eigenvalues at these speeds use `eigenvalues` or `jj.critical`.
     """
 
     weave_speed: Scalar  # lean and steer oscillations decay above it
     capsize_speed: Scalar  # a slow fall to one side grows above it
     double_root_speed: Scalar  # the two unstable real eigenvalues are the weave pair above it
     stable_from: Scalar  # start of the widest range of speeds with four decaying modes (no derivative)
-    stable_to: Scalar  # its end, at most the largest speed examined (no derivative)
+    stable_to: Scalar  # end of this range, at most the largest speed examined (no derivative)
     stable_range_exists: Flag
 
 
 def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
-    """Return the state of upright straight running at `speed` (m/s). It is a steady motion, unless
-    `lean_rate` (rad/s) adds a kick. The state satisfies the constraints exactly.
+    """Return the state of upright straight running at `speed` (m/s), a steady motion, with the lean rate
+    `lean_rate` (rad/s). The state satisfies the constraints exactly.
     """
     q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
     return state_of(bicycle, 0.0, q, u)
@@ -98,7 +98,7 @@ def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
     return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
 
 
-# the first call takes 10 s of processor time instead of 23; the second 6 ms
+# with this, the first call takes 10 s of processor time instead of 23, and the second 6 ms
 _matrices = compiled_quickly(_linearised)
 
 
@@ -107,9 +107,9 @@ def eigenvalues(
 ) -> Complex[Array, "speeds 4"]:
     """Return the four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
 
-    Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues). If real
-    eigenvalues lie on both sides of a pair, the lower is castering, the higher capsize, and the pair is
-    weave. A pair has its negative frequency first.
+    The modes are named in the order of ascending real parts (at rest: two decaying, then two growing real
+    eigenvalues). If real eigenvalues lie on both sides of a complex pair, the lower one is castering, the
+    higher one capsize, and the pair is weave. The eigenvalue of a pair with negative frequency comes first.
     """
     M, C1, K0, K2, g = _as_matrices(M, C1, K0, K2, g)
 
@@ -129,9 +129,9 @@ def stability_speeds(
         speeds = stability_speeds(M, C1, K0, K2, 9.81)
         jax.vmap(stability_speeds)(*many)  # a leading axis on each of the five, g included
 
-    Weave: a pair +-i omega crosses into the left half-plane as v grows. Capsize: the lowest speed at which a
-    real eigenvalue crosses zero upwards. Double root: the highest speed, below the weave speed if there is
-    one, at which two positive real eigenvalues meet and become a pair.
+    As v grows, a complex pair crosses into the left half-plane at the weave speed. The capsize speed is the
+    lowest one at which a real eigenvalue becomes positive. The double-root speed is the highest one, below
+    the weave speed if there is one, at which two positive real eigenvalues become a complex pair.
 
     **Arguments:** `M`, `C1`, `K0`, `K2`, (2, 2) in the order lean, steer; `g` (m/s^2); `max_speed`, the
     largest speed (m/s) examined. **Returns:** a `StabilitySpeeds`. Derivatives follow from the implicit
@@ -173,7 +173,7 @@ _speeds = compiled_quickly(_stability_speeds)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
-    """Return eigenvalues in the order castering, capsize, weave, weave that `eigenvalues` describes."""
+    """Return eigenvalues in the order castering, capsize, weave, weave, as described in `eigenvalues`."""
     values = values[jnp.lexsort((values.imag, values.real))]
     is_pair = values.imag != 0
     pair_between = is_pair[1] & is_pair[2] & ~is_pair[0] & ~is_pair[3]
@@ -186,7 +186,7 @@ def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
 
 
 def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return b4, b3, b2(x), b1(x), b0(x) of the module docstring."""
+    """Return the coefficients b4, b3, b2(x), b1(x), b0(x), defined in the module docstring."""
     M, C1, K0, K2, g = matrices
 
     def mixed(A, B):  # det(A + B) - det A - det B
@@ -206,7 +206,7 @@ def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
 
 
 def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
-    """Return a4, a3, a2, a1, a0 at one speed."""
+    """Return the coefficients a4, a3, a2, a1, a0 at one speed."""
     b4, b3, b2, b1, b0 = (jnp.polyval(b, v**2) for b in _coefficients(matrices))
     return jnp.stack([b4, v * b3, b2, v * b1, b0])
 
@@ -243,19 +243,19 @@ def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"]
     inverse = jnp.roots(jax.lax.stop_gradient(polynomial)[::-1], strip_zeros=False)
     there = (inverse.imag == 0) & (inverse.real * top > 1)
     x = jnp.where(there, 1 / jnp.where(there, inverse.real, 1.0), 1.0)
-    for _ in range(3):  # the last two carry one order of derivatives each
+    for _ in range(3):  # each of the last two steps adds one order of derivatives
         slope = _slope(polynomial, x)
         x = x - jnp.polyval(polynomial, x) / jnp.where(there & (slope != 0), slope, jnp.inf)
     return x, there
 
 
 def _root_where(there, x: Scalar) -> Scalar:
-    """Return the square root of x, or NaN without derivative."""
+    """Return the square root of x where `there` is True, else NaN without derivative."""
     return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
 
 
 def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
-    """Return whether two positive real eigenvalues become a pair at a root x, as the speed grows."""
+    """Return whether two positive real eigenvalues become a complex pair at a root x as the speed grows."""
     v = jnp.sqrt(x)
     fixed = jax.lax.stop_gradient(matrices)
     coefficients, slopes = jax.jvp(lambda v: _characteristic(fixed, v), (v,), (jnp.ones_like(v),))
@@ -268,8 +268,8 @@ def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
 def _widest_stable_range(
     matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Return the ends of the widest interval between neighbouring crossing speeds with only decaying modes,
-    or NaN. They have no derivative.
+    """Return the ends of the widest interval between neighbouring `crossings` in which all modes decay, or
+    NaN. They have no derivative.
     """
     matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
     ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))

@@ -1,9 +1,8 @@
-"""Limits of quantities that depend on the parameters, by Monte Carlo from measured standard deviations.
+"""Limits of quantities that depend on the parameters, by a Monte Carlo with the measured standard deviations.
 
 Parameters are drawn from a normal distribution with the measured values and their covariance, or
-independently if the covariance is unknown, as from parameter files. A quantity that only some bicycles have
-(a capsize speed) is reported with the fraction of samples that have it, and its limits are taken over these
-samples.
+independently if the covariance is unknown, as from parameter files. If only some samples have a quantity,
+such as a capsize speed, their fraction is reported, and the limits refer to them.
 """
 
 import equinox as eqx
@@ -23,7 +22,7 @@ class ParameterSamples(eqx.Module):
     """Sampled parameters of one bicycle, in SI units."""
 
     values: Float[Array, "samples parameters"]  # columns in the order of `PARAMETER_NAMES`
-    physical: Bool[Array, " samples"]  # False for a sample with a negative radius, for example
+    physical: Bool[Array, " samples"]  # False for an impossible sample, such as one with a negative radius
     refused: dict[str, Array]  # violated condition, as a sentence -> number of samples
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
@@ -32,9 +31,9 @@ class ParameterSamples(eqx.Module):
 
 
 class Interval(eqx.Module):
-    """A quantity with limits that contain 95 % of the samples that have it."""
+    """A quantity with limits that contain 95 % of the samples with this quantity."""
 
-    value: Scalar  # NaN if there is none
+    value: Scalar  # NaN if the bicycle lacks the quantity
     low: Scalar  # 2.5 % quantile, NaN if no sample has the quantity
     high: Scalar  # 97.5 % quantile
     fraction: Scalar  # share of the counted samples that have the quantity
@@ -44,7 +43,7 @@ def sample_parameters(
     bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int
 ) -> ParameterSamples:
     """Return `count` bicycles drawn from a normal distribution with the measured values and their covariance.
-    Without a covariance, parameters are independent, with their sigmas.
+    If this is unknown, parameters are independent, with their sigmas.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())
@@ -73,7 +72,7 @@ def _root(bicycle: MeasuredBicycle) -> np.ndarray:
     sigma = np.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
     if bicycle.covariance is None:
         return np.diag(sigma)
-    scale = np.where(sigma > 0, sigma, 1.0)  # scales to correlations, so that units do not matter
+    scale = np.where(sigma > 0, sigma, 1.0)  # correlations do not depend on units
     squares, directions = np.linalg.eigh(bicycle.covariance / np.outer(scale, scale))
     return scale[:, None] * directions * np.sqrt(np.maximum(squares, 0.0))
 
@@ -84,7 +83,7 @@ def interval(
     nominal: ArrayLike | None = None,
     counted: Bool[Array, " samples"] | None = None,
 ) -> Interval:
-    """Return limits of a sampled quantity, over the samples that have it (finite ones).
+    """Return limits of a sampled quantity over the samples in which it is finite.
 
     **Arguments:** `values`, one per sample, NaN if a sample lacks the quantity; `nominal`, the quantity of
     the bicycle as measured (default: the median of the samples); `counted`, False for samples to exclude,

@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    # run as a process: tracing makes millions of short-lived objects, so collect garbage rarely
+    # tracing makes millions of short-lived objects, so a short process collects garbage rarely
     if arguments is None:
         gc.freeze()
         gc.set_threshold(50_000, 20, 20)
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
         return USAGE
     options = parser().parse_args(arguments)
-    # cheaper compilation for programs that run once; other series may not know the flags
+    # cheaper compilation for programs that run once; other versions of jaxlib may not know the flags
     if jaxlib.__version__.startswith("0.10."):
         os.environ.setdefault(
             "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"

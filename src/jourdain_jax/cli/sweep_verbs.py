@@ -20,8 +20,8 @@ rtol = 1e-6
 [correlation]
 "radius lean" = 0.5
 
-`seed`, `save`, `keep_every`, and the tables `set`, `options` and `correlation` are optional. Other outputs:
-`largest-magnitude`, `happened`.
+`seed`, `save`, `keep_every`, and the tables `set`, `options` and `correlation` are optional. A further
+output is `largest-magnitude`.
 """
 
 import json
@@ -102,7 +102,7 @@ def _sweep(options) -> bool:
                 f"`{action}` is not an action of `sweep`; {nearest(action, ACTIONS)} To run a "
                 "study: jourdain-jax sweep FILE.toml --out FOLDER"
             )
-        # size limit in bytes; tables may have one row per sample
+        # limit of the file size in bytes; tables may have one row per sample
         text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
@@ -152,7 +152,9 @@ def _run(text: str, source: str, out: str, options) -> bool:
 
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
-    """Return the study described by a file and the arguments of its `run`; `memory` bounds the build."""
+    """Return the study described by a file, and the arguments of its `run`. `memory` bounds the memory of the
+    study.
+    """
     check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
         if key in TABLES and not isinstance(asked[key], Mapping):

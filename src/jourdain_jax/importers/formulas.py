@@ -61,9 +61,7 @@ class Formulas:
         self._steps, self._results = sympy.cse(flat, symbols=sympy.numbered_symbols("s", cls=sympy.Dummy))
 
     def values(self, leaves: Mapping[Any, Any], on: ModuleType = jnp) -> dict[Any, list]:
-        """Return the values of all lists for these `leaves`, computed by the functions of `on`: `jax.numpy`
-        or `numpy`.
-        """
+        """Return the values of all lists for these `leaves`, computed by `on`: `jax.numpy` or `numpy`."""
         known = dict(leaves)
         for symbol, expression in self._steps:
             known[symbol] = _value(expression, known, on)
@@ -71,7 +69,7 @@ class Formulas:
         return {name: [next(flat) for _ in range(length)] for name, length in self._lengths.items()}
 
     def numbers(self, leaves: Mapping[Any, float]) -> dict[Any, np.ndarray]:
-        """Return the values of all lists as known numbers, in double precision."""
+        """Return the values of all lists as NumPy arrays, in double precision."""
         with np.errstate(all="ignore"):
             found = self.values({symbol: np.float64(x) for symbol, x in leaves.items()}, np)
         return {name: np.array(values, np.float64) for name, values in found.items()}
@@ -79,7 +77,7 @@ class Formulas:
 
 def check_functions(expression, leaves) -> None:
     """Raise ValueError for a function in the expression that JAX lacks, and for a number that is not real.
-    The `leaves` are not examined.
+    The symbols `leaves` are not examined.
     """
     if expression.is_Atom and expression.is_number and not expression.is_extended_real:
         raise ValueError(f"`{expression}` is not a real number; check the expressions that contain it")

@@ -27,30 +27,30 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
         Arm = jj.from_mjcf("arm.xml", ignore=("armature",))
         jj.simulate(Arm(), {"elbow": 0.3}, t1=1.0)
 
-    - `path`: of the file, or its text.
+    - `path`: path of the file, or its text.
     - `free`: names of bodies whose position in the parent's frame becomes a parameter.
     - `ignore`: names of elements and attributes to omit although they change the motion, such as "armature"
       or "equality". With "inertia", impossible moments of inertia are accepted.
 
     **Returns** a class. Hinges and slides are coordinates with their names. A ball joint is a quaternion with
     its name; a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints without a
-    name are called `<body>_joint`, with a number from the second on. Speeds are defined as in MuJoCo. Motors
-    of joints and of sites are inputs; as in MuJoCo, `ctrlrange` limits the input and `forcerange` its force.
-    Nonzero values of the file are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame),
-    `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`, `<joint>_stiffness` and `gravity`
-    (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms come from their mass or density.
-    The pose of the file is the `example`.
+    name are called `<body>_joint`, the second and later ones with a number. Speeds are defined as in MuJoCo.
+    Motors of joints and of sites are inputs; as in MuJoCo, `ctrlrange` limits the input and `forcerange` its
+    force. Nonzero values of the file are fields: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's
+    frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`, `<joint>_stiffness` and
+    `gravity` (m/s^2), and `<body>_origin` (m) of bodies in `free`. Inertias of geoms come from their mass or
+    density. The pose of the file is the `example`.
 
-    `connect`, `weld` and `joint` of `equality` become exact geometric constraints: loops are closed as in the
-    stated pose.
+    `connect`, `weld` and `joint` of `equality` become exact geometric constraints, so that loops are closed
+    as in the pose of the file.
 
-    Geoms are drawn, but their contacts are not read: state rolling in `contacts` of a subclass. Limits of
+    Geoms are drawn, but their contacts are not imported: add rolling in `contacts` of a subclass. Limits of
     joints do not stop a motion; they become the `domain`.
 
-    **Raises** ValueError, with the name, for an unreadable file, a moving body without mass, impossible
-    moments of inertia and repeated statements. Unless `ignore` names them, unknown contents also raise it,
-    such as a misspelt attribute, and unsupported contents that change the motion, such as `tendon`,
-    `armature` or `frictionloss`. A warning lists other omitted elements.
+    **Raises** ValueError, which names the part, for an unreadable file, a moving body without mass,
+    impossible moments of inertia, and repeated definitions. Unknown contents, such as a misspelt attribute,
+    and unsupported contents that change the motion, such as `tendon`, `armature` or `frictionloss`, also
+    raise it, unless `ignore` names them. A warning lists other omitted elements.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_labels(free))
@@ -64,13 +64,13 @@ class _Reader(GeomReader):
     def __init__(self, file: XmlFile):
         super().__init__(file)
         self.links: list[Link] = []
-        # site -> its body, and its position and rotation there
+        # site -> its body, and its position and rotation in that body
         self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}
         self.moving: set[str | None] = set()  # names of links
         self.start: dict[str, float] = {}
 
     def tree(self, free: Labels) -> Tree:
-        """Return the mechanism."""
+        """Return the mechanism in the file."""
         for section in self.file.root.findall("worldbody"):
             name = "world" if not self.links else f"world {len(self.links) + 1}"
             looks = self._looks(self._geoms(section, None, "the world"))
@@ -105,7 +105,7 @@ class _Reader(GeomReader):
                 continue
             if follows:
                 yield Follower(one or "", other or "", tuple(tie.numbers("polycoef", None, [0.0, 1.0])))
-            elif element.tag == "weld":  # its anchor is a point of the second body
+            elif element.tag == "weld":  # the anchor is a point of the second body
                 yield Closure(
                     element.get("name") or tie.what, other, one, tie.numbers("anchor", 3, np.zeros(3)), True
                 )
@@ -148,7 +148,7 @@ class _Reader(GeomReader):
         if moves:
             self.moving.add(name)
         geoms = self._geoms(body, childclass, what)
-        mass = self._mass(part, geoms) if moves else None  # parts that never move need no mass
+        mass = self._mass(part, geoms) if moves else None  # fixed bodies need no mass
         self.links.append(Link(name, parent, position, turn, joints, mass, self._looks(geoms)))
         self._children(body, name, childclass)
 
@@ -205,9 +205,7 @@ class _Reader(GeomReader):
             )
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
-        """Return the range that limits a motor's control or force; None if there is none or it is switched
-        off.
-        """
+        """Return the range of a motor's control or force; None if it has no limit."""
         low, high = motor.numbers(f"{what}range", 2, [0.0, 0.0])
         limited, inferred = motor.given.get(f"{what}limited", "auto"), self.settings["autolimits"] == "true"
         if (limited == "true" and low >= high) or (

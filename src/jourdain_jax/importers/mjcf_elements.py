@@ -10,13 +10,13 @@ _CONTACT = (
     "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale"
     " fluidcoef"
 )
-# actuators that share their defaults with `motor`, for the attributes that it has
+# actuators whose defaults also apply to the attributes of `motor`
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
 _IDLE = "camera light visual statistic size sensor keyframe custom contact texture material hfield skin"
 _SOFT = "class solref solimp"
 _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
-# Supported contents of elements, and attributes of their classes; all others raise an error. `idle` are
-# contents on contacts, limits, drawing, and the other engine's computation.
+# Supported contents of elements, and attributes of their classes; all others raise an error. `idle` contents
+# concern contacts, limits, drawing, and MuJoCo's own computation.
 TABLE = {
     "mujoco": Holds(
         "model", many="compiler option default worldbody asset actuator equality include", listed=_IDLE
@@ -165,8 +165,8 @@ class Defaults:
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> Part:
-        """Return the checked element. Missing attributes come from its class, or else from the class of the
-        enclosing bodies.
+        """Return the element after checking it. Missing attributes come from its class, or else from the
+        class of the enclosing bodies.
         """
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
@@ -177,7 +177,9 @@ class Defaults:
 
 
 def all_of(file: XmlFile, path: str) -> Part:
-    """Return all sections at a path merged into one. If several state an attribute, the last one counts."""
+    """Return all sections at a path merged into one. If several of them have the same attribute, the last
+    value is used.
+    """
     return Part(
         file,
         f"`{path.rpartition('/')[2]}`",

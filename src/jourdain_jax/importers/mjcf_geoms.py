@@ -25,7 +25,7 @@ Place = tuple[Vector, Matrix]  # position and rotation
 Geom = tuple[Part, str, Place]  # attributes, type, and frame relative to the body
 HERE = np.zeros(3), np.eye(3)
 _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}  # attribute -> count of numbers
-# shape for drawing, and factors of the sizes
+# type -> shape for drawing, and factors of the sizes
 _LOOKS: dict = {"sphere": ("ball", 1), "ellipsoid": ("ellipsoid", 1), "box": ("box", 2)}
 _LOOKS |= {kind: (kind, [1, 2]) for kind in ("capsule", "cylinder")}
 
@@ -163,7 +163,7 @@ class GeomReader:
 
     def _place(self, given: Part) -> Place:
         """Return position and rotation from attributes. Raises ValueError for several rotations, and for
-        numbers that define none.
+        numbers that define no rotation.
         """
         position = given.numbers("pos", 3, np.zeros(3))
         stated = [word for word in _TURNS if word in given]
@@ -182,7 +182,7 @@ class GeomReader:
         return position, turn
 
     def _turn(self, word: str, x: np.ndarray) -> Matrix:
-        """Return the rotation that the numbers of an attribute define; NaN if they define none."""
+        """Return the rotation that the numbers `x` of an attribute define; NaN if they define none."""
         if word == "quat":
             return by_quaternion(x)
         if word == "axisangle":
@@ -198,5 +198,5 @@ class GeomReader:
 
 
 def within(frame: Place, inner: Place) -> Place:
-    """Return a place in a frame as a place in the frame's parent."""
+    """Convert a place in a frame to a place in the parent of that frame."""
     return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]

@@ -1,5 +1,5 @@
 """Constant rotation matrices from angles, quaternions and axes; combined masses; volumes and moments of
-inertia of uniform solids, with sizes as in MJCF: radii and half lengths.
+inertia of uniform solids. Sizes are those of MJCF: radii and half lengths.
 """
 
 import math
@@ -33,7 +33,7 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 
 
 def combined(masses: list[Mass]) -> Mass:
-    """Return several masses in one frame combined, with the inertia by the parallel-axis theorem,
+    """Return the combined mass properties of several masses in one frame, by the parallel-axis theorem,
 
     I = sum I_i + m_i (d_i.d_i - d_i d_i').
     """
@@ -60,7 +60,9 @@ def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
-    """Return principal moments about the centre for 1 kg. The axis of cylinders and capsules is z."""
+    """Return principal moments of inertia about the centre of a solid of 1 kg. The axis of cylinders and
+    capsules is z.
+    """
     if kind in ("sphere", "ellipsoid", "box"):
         squares = np.square(np.broadcast_to(size, 3))
         return (np.sum(squares) - squares) / (3 if kind == "box" else 5)

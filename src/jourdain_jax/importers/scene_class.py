@@ -10,7 +10,7 @@ from typing import Any
 
 from jourdain_jax.scene.scene import Scene
 
-_TAKEN = ("t", "array", "slots", "keys")  # used for the time and by the container of named values
+_TAKEN = ("t", "array", "slots", "keys")  # names of the time and of attributes of containers
 
 
 def identifier(name: str) -> str:
@@ -23,8 +23,8 @@ def identifier(name: str) -> str:
 
 
 def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
-    """Return name -> its identifier, with a trailing underscore if it is `taken`. Raises ValueError for names
-    that are or become equal.
+    """Return name -> identifier, with a trailing underscore if the identifier is `taken`. Raises ValueError
+    for equal names, and for names with equal identifiers.
     """
     found: dict[str, str] = {}
     taken = set(taken)

@@ -1,14 +1,14 @@
 """Poses of SymPy's bodies, and the additional coordinates that they need.
 
 SymPy allows velocities that are unrelated to positions: a rolling disc with a contact point at rest, or a
-wheel with a rate of rotation but no angle. Here velocities are the rates of poses. If both disagree,
-coordinates d are added whose rates are the difference,
+wheel with a rate of rotation but no angle. Here velocities are the rates of poses. If SymPy's velocity
+differs from the rate of the position, coordinates d are added whose rates are the difference,
 
     r = r(q) + d,   ddot = v(q, u) - dr/dt,
 
-one for each inertial axis with a difference at states that satisfy the constraints, shared by the bodies with
-the same difference. A frame that has an angular velocity about an axis of another frame, but no orientation,
-gets an angle.
+one for each inertial axis along which they differ at states that satisfy the constraints. Bodies with the
+same difference share them. A frame that has an angular velocity about an axis of another frame, but no
+orientation, gets an angle.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class Pose:
 
 
 def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
-    """Return the system with added coordinates, and the poses of its bodies."""
+    """Return the system with any added coordinates, and the poses of its bodies."""
     poses: list[Pose] = []
     angles: dict[Any, tuple] = {}  # frame -> orientation, base frame, rotation relative to it
     for body in system.bodies:
@@ -55,12 +55,12 @@ def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
 
 
 def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[MechanicalSystem, Pose | None]:
-    """Return the pose of a body at SymPy's position (zero if it has none); None if the body does not move or
-    has no mass.
+    """Return the pose of a body at SymPy's position (zero if SymPy has none), or None if the body does not
+    move or has no mass.
     """
     sympy = sympy_package()
-    name = str(getattr(body, "name", body))  # a `Particle` of SymPy 1.12 has its name as its text
-    # its `Body` may be a particle
+    name = str(getattr(body, "name", body))  # `str` of a `Particle` of SymPy 1.12 is its name
+    # a `Body` of SymPy may be a particle
     rigid = isinstance(body, sympy.physics.mechanics.RigidBody) and getattr(body, "is_rigidbody", True)
     # SymPy inserts such bodies into joints with several axes
     if body.mass == 0 and not (rigid and body.central_inertia != 0):
@@ -90,7 +90,7 @@ def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[Mec
 
 
 def _in_own_frame(body, name: str, angle: tuple | None):
-    """Return the central inertia along the axes of the body."""
+    """Return the inertia about the mass centre, along the axes of the body."""
     ways = [(body.frame, None)] if angle is None else [(body.frame, None), angle[1:]]
     for frame, turn in ways:
         try:
@@ -106,8 +106,8 @@ def _in_own_frame(body, name: str, angle: tuple | None):
 
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
-    """Return the system with an angle for a frame without orientation, and the frame's orientation, base
-    frame and rotation relative to the base.
+    """Return the system with an added angle for a frame without orientation, and that frame's orientation,
+    base frame and rotation relative to the base.
     """
     sympy = sympy_package()
     for parent, velocity in frame._ang_vel_dict.items():
@@ -167,8 +167,8 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
 
 
 def _moved(system: MechanicalSystem, poses: list[Pose]) -> tuple[MechanicalSystem, list[Pose]]:
-    """Return the poses with positions whose rates are the given velocities, with added coordinates if
-    necessary, and the system.
+    """Return poses whose positions have SymPy's velocities as rates, and the system with any coordinates that
+    this requires.
     """
     sympy = sympy_package()
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]

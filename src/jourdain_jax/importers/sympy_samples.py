@@ -13,13 +13,13 @@ from jourdain_jax.calculus.reals import all_finite
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
-_STATES, _TRIES = 3, 40  # number of random states compared, and of states tried
+_STATES, _TRIES = 3, 40  # number of random states that are compared, and limit of tried states
 _STEP = 1e-6  # of finite differences
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One state, with the values and rates of expressions by name of their list."""
+    """One state, with values and rates of expressions, by the name of their list."""
 
     leaves: dict[Any, float]
     values: dict[str, Float[np.ndarray, "_"]]
@@ -41,10 +41,10 @@ def symbols_in(expressions: Iterable[Any]) -> set[Any]:
 def sampled(
     system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: Iterable[Any] = ()
 ) -> list[Sample]:
-    """Return the first random states at which all expressions are finite. Their speeds are the nearest to
-    random ones that satisfy the constraints `rows`, which are affine in the speeds.
+    """Return the first random states at which all expressions are finite. Random speeds are projected onto
+    the constraints `rows`, which are affine in the speeds.
 
-    Constants with given numbers keep them. Raises ValueError, with the name of a list, if there are too few
+    Constants with given numbers have these. Raises ValueError, with the name of a list, if there are too few
     such states.
     """
     named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()}
@@ -91,8 +91,8 @@ def sampled(
 def affine(
     values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Return `[A b]` of A u + b from the `values` at given leaves: the values at rest, and their increments
-    for each speed.
+    """Return `[A b]` of the affine function A u + b, computed by `values(leaves)` at rest and at a unit of
+    each speed.
     """
     rest = leaves | dict.fromkeys(speeds, 0.0)
     b = values(rest)

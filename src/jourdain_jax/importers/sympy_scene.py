@@ -1,5 +1,5 @@
-"""Scenes from SymPy's mechanics: SymPy expressions for poses, loads and constraints are evaluated on JAX; the
-equations of motion are derived here.
+"""Scenes from SymPy's mechanics. SymPy's expressions for poses, loads and constraints are evaluated by JAX;
+the equations of motion are derived here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True)
 class _Expressions:
-    """The expressions of a system, and the scene's name for each of their symbols."""
+    """The expressions of a system, and the name in the scene of each symbol."""
 
     time: Any
     q: tuple[Any, ...]
@@ -36,7 +36,9 @@ class _Expressions:
     formulas: dict[str, Formulas]  # of bodies, rates, loads, and geometric and velocity constraints
 
     def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Scalar]]:
-        """Return the values of a part; `others`: speeds and inputs, if it depends on them."""
+        """Return the values of a part of the formulas. `others`: speeds and inputs, if the part depends on
+        them.
+        """
         leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
             leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
@@ -74,7 +76,7 @@ class SympyScene(Scene):
         return jnp.stack(self._expressions.values("rates", self, t, q, u)["rates"])
 
     def loads(self, motion):
-        """Return SymPy's loads; constant ones have a potential."""
+        """Return SymPy's loads; constant forces have a potential."""
         kinds: dict[str, dict] = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
         values = self._expressions.values("loads", self, motion.t, motion.q, motion.u, motion.inputs)
         for (kind, name), value in values.items():
@@ -102,8 +104,8 @@ class SympyScene(Scene):
 def from_sympy(
     system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene"
 ) -> type[Scene]:
-    """Return a class of scenes from SymPy's mechanics: poses, loads and constraints are imported, and the
-    equations of motion derived.
+    """Return a class of scenes from SymPy's mechanics. Poses, loads and constraints are imported; the
+    equations of motion are derived by the engine.
 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81})
         jj.simulate(Pendulum(), {"q": 0.3}, t1=5.0)
@@ -113,17 +115,17 @@ def from_sympy(
     - `origin`: SymPy's point of origin for positions, at rest or moving (default: the `fixed_point` of a
       `System`; otherwise required).
     - `values`: symbol, or its name, -> number, for every constant in the expressions, in its unit.
-    - `name`: of the class.
+    - `name`: name of the class.
 
     **Returns** a class. Coordinates and speeds have SymPy's names; the speeds are SymPy's generalized speeds.
     Constants are parameters with the given `values` as defaults. Functions of time that are neither
     coordinates nor speeds are inputs. The class can be subclassed, for instance to add `events`.
 
-    SymPy may state velocities without positions, as for a rolling disc whose contact point has no position.
-    These add coordinates: `C_x`, `C_y` for the path of the `origin` C, `W_angle` for a frame W with an
-    angular velocity and no orientation.
+    SymPy may have velocities without positions, as for a rolling disc whose contact point has no position.
+    Coordinates are added for these: `C_x`, `C_y` for the path of the `origin` C, `W_angle` for a frame W with
+    an angular velocity and no orientation.
 
-    **Raises** ValueError, with the name, for a constant without a value, a value without a constant, a
+    **Raises** ValueError, which names the part, for a constant without a value, a value without a constant, a
     function that JAX lacks, a system without bodies or kinematic equations, and a rate without an equation.
     Raises ImportError without `sympy`.
 
@@ -152,7 +154,7 @@ def from_sympy(
 
 
 def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type[Scene]:
-    """Return the class, from known poses."""
+    """Return the class of scenes of a system with these poses."""
     bodies: dict[Any, Any] = {}
     for pose in poses:
         bodies |= {("mass", pose.name): [pose.mass], ("position", pose.name): pose.position}
@@ -220,11 +222,11 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
 
 
 def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str, Any], Any]:
-    """Return the loads by kind and place, inertial frame: "weight" (constant, so that it has a potential),
-    "force" and "torque" of a body, "generalized" of a speed.
+    """Return the loads, in the inertial frame, by kind and place: "weight" (a constant force, which has a
+    potential), "force" and "torque" on a body, "generalized" force of a speed.
 
-    A force on a point other than a mass centre, or a torque on a frame other than a body's, enters by its
-    power: Q_k = F . dv/du_k, with SymPy's velocity of the point or frame.
+    A force on a point other than a mass centre, or a torque on a frame other than a body's, becomes the
+    generalized force Q_k = F . dv/du_k, with SymPy's velocity of the point or frame.
     """
     sympy = sympy_package()
     found: dict[tuple[str, Any], Any] = {}
@@ -245,7 +247,9 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str
 
 
 def velocity_rows(system: MechanicalSystem) -> list[Any]:
-    """Return the velocity constraints without rates of geometric constraints; SymPy requires both."""
+    """Return the velocity constraints other than rates of geometric constraints, which SymPy
+    requires, too.
+    """
     rows = [system.resolved(row) for row in system.velocity]
     if not rows or not system.configuration:
         return rows
@@ -259,14 +263,14 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
             for name in both
         )  # type: ignore[misc]
         left = given - given @ np.linalg.pinv(implied) @ implied
-        # relative remainder of a row after the geometric rows
+        # relative part of a row that is independent of the rates of geometric constraints
         kept |= largest(left, 1) > 1e-9 * largest(given, 1)
     return [row for row, keep in zip(rows, kept, strict=True) if keep]
 
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
-    """Raise ValueError for a function of time that can be neither a coordinate nor an input: no kinematic
-    equation contains it, but its rate occurs, or poses depend on it.
+    """Raise ValueError for a function of time that can be neither a coordinate nor an input, because no
+    kinematic equation contains it, but its rate occurs or poses depend on it.
     """
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds

@@ -1,5 +1,5 @@
-"""Parts imported from SymPy's mechanics: coordinates, speeds, kinematic equations, bodies, loads and
-constraints, but no equations of motion.
+"""The imported parts of a system of SymPy's mechanics: coordinates, speeds, kinematic equations, bodies,
+loads and constraints, but no equations of motion.
 """
 
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ from jourdain_jax.importers.formulas import sympy_package
 
 @dataclass(frozen=True)
 class MechanicalSystem:
-    """A system as SymPy describes it; expressions in q(t), u(t), t and constants."""
+    """A mechanical system of SymPy, with expressions in q(t), u(t), t and constants."""
 
     given: Mapping[str, float]  # numbers of constants, by name
     origin: Any  # the point from which positions are measured
-    frame: Any  # inertial
+    frame: Any  # the inertial frame
     coordinates: tuple[Any, ...]
     speeds: tuple[Any, ...]
     rates: dict[Any, Any]  # qdot -> expression in q, u, t
     bodies: tuple[Any, ...]
     loads: tuple[tuple[Any, Any], ...]  # a point and a force, or a frame and a torque
     configuration: tuple[Any, ...]  # expressions that vanish
-    velocity: tuple[Any, ...]  # the same, affine in u
+    velocity: tuple[Any, ...]  # expressions, affine in u, that vanish
     auxiliary: tuple[Any, ...]  # speeds fixed at zero
 
     def resolved(self, expression):
@@ -46,7 +46,7 @@ class MechanicalSystem:
         return sympy_package().physics.mechanics.dynamicsymbols._t
 
     def is_constant(self, expression) -> bool:
-        """Return whether it depends only on constants."""
+        """Return whether the expression depends only on constants."""
         return not expression.has(self.time) and not expression.atoms(
             sympy_package().core.function.AppliedUndef
         )

@@ -1,7 +1,8 @@
-"""Links and joints of robot files: a tree of frames, each placed in its parent and moved by its joints.
+"""Links and joints of robot files: a tree of frames. Each has a place in its parent frame and is moved by its
+joints.
 
-All numbers are known, in SI units and radians; rotation matrices convert components from the link's frame to
-its parent's.
+All values are plain numbers in SI units and radians. Rotation matrices convert components from the link's
+frame to the parent's.
 """
 
 from dataclasses import dataclass, field
@@ -15,15 +16,15 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True)
 class Joint:
-    """The motion of a link relative to its place; the base has `name` ""."""
+    """The motion of a link relative to its place. The joint of a moving base has the `name` ""."""
 
     name: str
     kind: str  # "hinge", "slide", "ball", "free" or "planar"
-    # unit vector; the normal for a planar joint
+    # unit vector along the axis, or along the normal of a planar joint
     axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     # m, the fixed point of the link for a hinge or ball
     anchor: Vector = field(default_factory=lambda: np.zeros(3))
-    reference: float = 0.0  # the coordinate at the link's stated place
+    reference: float = 0.0  # the coordinate at the link's place in the file
     damping: float = 0.0  # N s/m or N m s
     stiffness: float = 0.0  # N/m or N m
     rest: float = 0.0  # the coordinate of the unloaded spring
@@ -67,19 +68,19 @@ class Link:
 
 @dataclass(frozen=True)
 class Follower:
-    """A joint whose coordinate q follows the coordinate of another joint, or stays constant: `q - reference =
-    sum of c_k (q_leader - its reference)^k`.
+    """A joint whose coordinate q is a polynomial of the coordinate of another joint, or constant:
+    `q - reference = sum of c_k (q_leader - its reference)^k`.
     """
 
     joint: str
-    leader: str  # "" for none
+    leader: str  # "" if q is constant
     coefficients: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Closure:
-    """A point of a link that coincides with a point of another link, as in the stated pose. With `turn`, the
-    links do not rotate relative to each other either.
+    """A point of a link that coincides with a point of another link, as in the pose of the file. With `turn`,
+    the links do not rotate relative to each other either.
     """
 
     name: str
@@ -101,8 +102,8 @@ class Push:
 
 @dataclass(frozen=True)
 class Motor:
-    """An input that drives a hinge or slide with `gear` times its value. Limits apply first to the input,
-    then to the force.
+    """An input that drives a hinge or slide with `gear` times its value, or pushes a link. Limits apply first
+    to the input, then to the force.
     """
 
     name: str
@@ -110,12 +111,12 @@ class Motor:
     gear: float = 1.0
     control: tuple[float, float] | None = None
     force: tuple[float, float] | None = None  # before the gear
-    push: Push | None = None  # force for an input of 1, instead of a joint
+    push: Push | None = None  # force and torque for an input of 1, in place of a joint
 
 
 @dataclass(frozen=True)
 class Tree:
-    """A mechanism, parents before their children."""
+    """A mechanism. Links are ordered, parents before their children."""
 
     name: str
     links: tuple[Link, ...]

@@ -20,8 +20,8 @@ from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
-ROUNDED = 0.05  # of the largest moment of inertia: some are published with two digits
-POINT = 1e-6**2  # m^2: with a smaller radius of gyration, moments are round-off
+ROUNDED = 0.05  # tolerance, times the largest moment of inertia: some are published with two digits
+POINT = 1e-6**2  # m^2: moments of a smaller squared radius of gyration are round-off
 
 Frame = tuple[Matrix3, Vector3]  # orientation and origin in the inertial frame
 
@@ -67,7 +67,7 @@ class TreeScene(Scene):
         return tuple(found)
 
     def geometric_constraints(self, pose):
-        """Return the constraints of joints that follow others, and of closed loops."""
+        """Return the constraints of dependent joints (`Follower`) and of closed loops."""
         if not self._tree.ties:
             return {}
         q, found = self.coordinates.reference(), {}
@@ -163,7 +163,9 @@ def _array(x) -> Float[Array, "*shape"]:
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
-    """Return the coordinates of a joint, as arguments of `coordinates`; the base's have no prefix."""
+    """Return the coordinates of a joint, as arguments of `jj.coordinates`. Those of the base have no
+    prefix.
+    """
     label = f"{name}_" if joint.name else ""
     if joint.kind == "ball":
         return (quaternion(name),)
@@ -234,7 +236,7 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     """Return the class of scenes of a mechanism. Raises ValueError, with the `source`, if nothing moves, a
     moving part has no mass, or moments of inertia are impossible.
 
-    `ignore`: if it contains "inertia", such moments are accepted.
+    `ignore`: if it contains "inertia", impossible moments are accepted.
     """
     moving = tree.moving()
     if not moving:
@@ -311,8 +313,8 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
 
 
 def _check_masses(tree: Tree, source: str, ignore: Labels) -> None:
-    """Raise ValueError for a joint that moves no mass, and for impossible moments of inertia. Links fixed to
-    each other count together.
+    """Raise ValueError for a joint that moves no mass, and for impossible moments of inertia. Links that are
+    fixed to each other are combined.
     """
     heavy: set[str] = set()
     fixed: dict[str | None, list[Mass]] = {

@@ -30,8 +30,8 @@ _BASES = ("fixed", "planar", "free")
 _SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {
     kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")
 }
-# Supported contents of elements; all others raise an error. Contents without effect on the motion are idle,
-# or listed in a warning.
+# Supported contents of elements; all others raise an error. Contents without effect on the motion are `idle`,
+# or `listed` in a warning.
 _TABLE = {
     "robot": Holds(
         "name",
@@ -94,7 +94,7 @@ def from_urdf(
                 wheels = {side: pose[f"{side}_wheel"] for side in ("left", "right")}
                 return {side: jj.disc_contact(wheel, 0.033, axis="z") for side, wheel in wheels.items()}
 
-    - `path`: of the file, or its text.
+    - `path`: path of the file, or its text.
     - `base`: the motion of the root link: "fixed"; "planar", with coordinates `x`, `y` (m) and `heading`;
       "free", with `x`, `y`, `z` and the quaternion `attitude`.
     - `motors`: names of revolute, continuous or prismatic joints that get an input, `<joint>_motor` in N m or
@@ -104,24 +104,24 @@ def from_urdf(
       0.0}`.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the
       file).
-    - `ignore`: names of elements and attributes to omit without a warning, "friction", or "text" between
-      elements. With "inertia", impossible moments of inertia are accepted.
+    - `ignore`: names of elements and attributes to omit without a warning, "friction", or "text" (text
+      between elements). With "inertia", impossible moments of inertia are accepted.
 
-    **Returns** a class. A joint is a coordinate with its name; a floating one is `<joint>_x`, `_y`, `_z` and
-    the quaternion `<joint>_attitude`, a planar one `<joint>_x`, `_y`, `_heading`. A joint with the name of a
-    coordinate of the base, such as `x`, becomes `x_`. Nonzero values of the file are fields: `<link>_mass`
-    (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the mass centre),
-    `<joint>_damping` and `gravity` (m/s^2), and `<link>_origin` (m) of links in `free`. Limits of joints do
-    not stop a motion; they become the `domain`. `mimic` becomes a geometric constraint, without effect on
-    fixed or locked joints. Shapes of `visual` are drawn; `collision` is not read: state rolling in `contacts`
-    of a subclass.
+    **Returns** a class. A joint becomes a coordinate with its name; a floating joint becomes `<joint>_x`,
+    `_y`, `_z` and the quaternion `<joint>_attitude`, a planar joint `<joint>_x`, `_y`, `_heading`. If a joint
+    has the name of a coordinate of the base, such as `x`, its coordinate is `x_`. Nonzero values of the file
+    are fields: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2,
+    about the mass centre), `<joint>_damping` and `gravity` (m/s^2), and `<link>_origin` (m) of links in
+    `free`. Limits of joints do not stop a motion; they become the `domain`. `mimic` becomes a geometric
+    constraint, without effect on fixed or locked joints. Shapes of `visual` are drawn; `collision` is not
+    imported: add rolling in `contacts` of a subclass.
 
-    **Raises** ValueError, with the name of the link or joint, for an unreadable file, an unknown type of
-    joint, a parent or child that does not exist, a loop, and repeated statements; also for a mass without
-    inertia, impossible moments of inertia (the largest above the sum of the others by more than 5 %), a joint
-    that moves no mass, and a joint with friction. Contents that do not belong to a URDF also raise it, with
-    their name: a misspelt attribute, `spring` of `dynamics`, `loop_joint`, text in place of an attribute. A
-    warning lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.
+    **Raises** ValueError, which names the link or joint, for an unreadable file, an unknown type of joint, a
+    parent or child that does not exist, a loop, and repeated definitions; for a mass without inertia,
+    impossible moments of inertia (the largest above the sum of the others by more than 5 %), a joint that
+    moves no mass, and a joint with friction; and for contents that do not belong to a URDF, such as a
+    misspelt attribute, `spring` of `dynamics`, `loop_joint`, or text in place of an attribute. A warning
+    lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.
     """
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
@@ -155,7 +155,7 @@ class _Reader:
                 )
 
     def tree(self, base: str, motors: Labels, free: Labels) -> Tree:
-        """Return the mechanism."""
+        """Return the mechanism in the file."""
         above: dict[str, tuple[str, str]] = {}  # link -> its joint and its parent
         for name, joint in self.joints.items():
             child, parent = (self._end(joint, which) for which in ("child", "parent"))
@@ -174,7 +174,7 @@ class _Reader:
         at_root = () if base == "fixed" else (Joint("", base),)
         content = self._content(self.links[roots[0]], base != "fixed")
         links = [Link(roots[0], None, np.zeros(3), np.eye(3), at_root, *content)]
-        for link in links:  # the list grows during the loop
+        for link in links:  # the loop appends to the list
             links += [
                 self._link(name, joint, parent)
                 for name, (joint, parent) in above.items()
@@ -322,6 +322,6 @@ class _Reader:
 
 def _origin(part: Part) -> tuple[Vector, Matrix]:
     origin = part.child("origin")
-    # about the fixed axes, in this order
+    # rotations about the fixed axes x, y, z, in this order
     turn = Rotation.from_euler("xyz", origin.numbers("rpy", 3, np.zeros(3)))
     return origin.numbers("xyz", 3, np.zeros(3)), turn.as_matrix()

@@ -1,5 +1,5 @@
-"""Reading XML: files, contents of elements, numbers in attributes. Unsupported contents raise an error or are
-listed in a warning.
+"""Reading of XML: files, contents of elements, numbers in attributes. Unsupported contents raise an error or
+are listed in a warning.
 """
 
 import difflib
@@ -20,7 +20,7 @@ from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.names import Labels, as_labels, check_name, nearest
 
 Element = ElementTree.Element
-LARGEST = 100_000_000  # bytes of a file
+LARGEST = 100_000_000  # bytes of the largest permitted file
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Holds:
     many: str = ""  # children, any number of each
     idle: str = ""  # attributes and children without effect on the motion, skipped silently
     listed: str = ""  # children without effect on the motion, listed in a warning
-    # attributes with effect on the motion -> values without effect
+    # attributes that may affect the motion -> their values without effect
     off: Mapping[str, str] = field(default_factory=dict)
     words: Mapping[str, Labels] = field(default_factory=dict)  # attributes -> their permitted values
 
@@ -41,8 +41,8 @@ class XmlFile:
     """A robot file during reading: its root, its location, and omitted parts."""
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
-        """Read the file at `path`, or the text itself. `table`: the permitted content of each element, the
-        root first. Raises ValueError for an unreadable file or other content.
+        """Read the file at `path`, or the text `path` itself. `table`: the permitted contents of each
+        element, the root first. Raises ValueError for an unreadable file and for other contents.
         """
         check_kind(path, FilePath, "`path`", f"the path of a {format_name} file, or its text")
         self.ignore, self.table = as_labels(ignore), table
@@ -79,8 +79,8 @@ class XmlFile:
             holder[k : k + 1] = list(inner)
 
     def _check(self, element: Element, what: str, kind: str) -> None:
-        """Raise ValueError for contents of an element that are not in the table and not in `ignore`. `what`:
-        the element, for messages.
+        """Raise ValueError for contents of an element that are neither in the table nor in `ignore`. `what`:
+        name of the element in messages.
         """
         holds = self.table[kind]
         self.check_attributes(kind, element.attrib, what)
@@ -101,7 +101,7 @@ class XmlFile:
             elif child.tag in holds.listed.split():
                 self.leave_out(child.tag)
             elif child.tag not in holds.idle.split():
-                # names of another namespace have no valid neighbour
+                # names of another XML namespace resemble no valid name
                 valid = f"{holds.one} {holds.many}" if tag == child.tag else ""
                 self.refuse(tag, f"`{child.tag}`{f' `{name}`' if name else ''} in {what}", valid=valid)
 
@@ -111,8 +111,8 @@ class XmlFile:
             self.refuse("text", f"the text `{shortened(text)}` in {what}", "state numbers in attributes")
 
     def check_attributes(self, kind: str, attributes: Mapping[str, str], what: str) -> None:
-        """Raise ValueError for an unknown attribute of this kind of element (unless ignored), and for an
-        unknown value of a known one.
+        """Raise ValueError for an unknown attribute of this kind of element, unless ignored, and for an
+        unknown value of a known attribute.
         """
         holds = self.table[kind]
         for name, value in attributes.items():
@@ -134,7 +134,7 @@ class XmlFile:
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
-        """Raise ValueError for unsupported content, unless `ignore` contains its `key`. `valid`: names to
+        """Raise ValueError for unsupported contents, unless `ignore` contains its `key`. `valid`: names to
         suggest.
         """
         if key not in self.ignore:
@@ -157,7 +157,7 @@ class XmlFile:
             warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this")
 
     def fault(self, what: str) -> ValueError:
-        """Return an error of this file."""
+        """Return a ValueError about this file."""
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
@@ -186,8 +186,8 @@ def _parsed(content: str | bytes, source: str) -> Element:
 
 
 class Part:
-    """An XML element during reading: its attributes, its children and its name `what` in messages. `element`
-    is None if the file lacks it.
+    """An XML element that is being read: its attributes, its children and its name `what` in messages.
+    `element` is None if the file lacks the element.
     """
 
     def __init__(
@@ -243,8 +243,8 @@ class Part:
         return self.file.fault(f"{word} of {self.what} is {what}")
 
     def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
-        """Return the mass properties of an element; None if they are zero. Raises ValueError for a mass that
-        is not positive; zero is allowed for a link that no joint moves.
+        """Return the mass properties of an element, or None for a zero mass. Raises ValueError for a mass
+        that is not positive, except zero for a link that no joint moves.
         """
         if mass == 0 and not np.any(inertia):
             return None

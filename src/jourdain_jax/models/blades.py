@@ -17,8 +17,9 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class Skate(Scene):
-    """A skate (knife edge) on an incline, with one constraint in three coordinates: the smallest nonholonomic
-    system with a force.
+    """A skate (knife edge) on an incline: one constraint in three coordinates.
+
+    It is the smallest nonholonomic system with a force.
 
         xdot sin(heading) - ydot cos(heading) = 0
         heading'' = 0,   v' = g sin(slope) cos(heading)                  (v: forward speed)
@@ -65,8 +66,9 @@ class Skate(Scene):
 
 
 class ChaplyginSleigh(Scene):
-    """The Chaplygin sleigh: a body on smooth ice with one blade, its mass centre a distance a ahead of the
-    blade.
+    """The Chaplygin sleigh: a body on smooth ice with one blade behind its mass centre.
+
+    a: distance of the mass centre ahead of the blade.
 
         -xdot sin(heading) + ydot cos(heading) - a headingdot = 0        (x, y of the mass centre)
         v' = a w^2,   w' = -(a/k^2) v w,   k^2 = I/m + a^2               (v forward speed, w turn rate)
@@ -204,8 +206,9 @@ class Snakeboard(Scene):
 
 
 class TrailerChain(Scene):
-    """A car (or skate) pulling a chain of trailers on on-axle hitches: n + 1 knife edges, 2 n pin
-    constraints, two degrees of freedom.
+    """A car (or skate) that pulls a chain of n trailers on on-axle hitches.
+
+    n + 1 knife edges and 2 n pin constraints leave two degrees of freedom.
 
         gamma_i' = w_{i-1} - (v_{i-1}/L) sin(gamma_i),   gamma_i = heading_{i-1} - heading_i
         v_i = v_{i-1} cos(gamma_i),   w_i = (v_{i-1}/L) sin(gamma_i)

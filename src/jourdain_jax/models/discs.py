@@ -15,8 +15,9 @@ from jourdain_jax.scene.parameter_fields import parameter
 
 
 class VerticalDisc(Heavy):
-    """An upright disc that rolls and turns on a level plane. Both rates are constant, and the path is a
-    circle or a straight line.
+    """An upright disc that rolls and turns on a level plane.
+
+    Both rates are constant, and the path is a circle or a straight line.
 
         xdot = R cos(heading) rolldot,   ydot = R sin(heading) rolldot
 
@@ -74,8 +75,9 @@ class _ThinDisc(Heavy):
 
 
 class TiltingDisc(_ThinDisc):
-    """A thin disc rolling without slip on a level plane, described by angles: the classic problem of Appell
-    and Korteweg.
+    """A thin disc that rolls without slip on a level plane, described by angles.
+
+    This is the classic problem of Appell and Korteweg.
 
     Contact and height are built into the coordinates (x, y: contact point). Two no-slip constraints, three
     degrees of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
@@ -109,8 +111,9 @@ _TILTED = TiltingDisc.example
 
 
 class TiltingDiscQuaternion(_ThinDisc):
-    """A thin disc rolling without slip on a level plane, described as a free body: position, quaternion, and
-    constraints for the contact.
+    """A thin disc that rolls without slip on a level plane, described as a free body.
+
+    It has position, quaternion, and constraints for the contact.
 
     One height constraint and two no-slip constraints on six speeds leave three degrees of freedom, with the
     motion of `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc

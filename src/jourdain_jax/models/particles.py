@@ -34,8 +34,9 @@ class _OnSheets(Scene):
 
 
 class RosenbergParticle(_OnSheets):
-    """Rosenberg's particle: free except for the constraint `zdot = y xdot`. It is the smallest nonholonomic
-    system whose free motion is not straight.
+    """Rosenberg's particle, which has the constraint `zdot = y xdot` and no forces.
+
+    It is the smallest nonholonomic system whose free motion is not straight.
 
         ydot = const,   xdot sqrt(1 + y^2) = const
 
@@ -61,8 +62,9 @@ class RosenbergParticle(_OnSheets):
 
 
 class HeisenbergParticle(_OnSheets):
-    """The Heisenberg system: a particle with the constraint `zdot = y xdot - x ydot` and no forces. It moves
-    in straight lines.
+    """The Heisenberg system: a particle with the constraint `zdot = y xdot - x ydot` and no forces.
+
+    It moves in straight lines.
 
     The variational ("vakonomic") principle with the same constraint would give helices, so that this system
     tests which principle an engine follows. Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003),
@@ -87,8 +89,9 @@ class HeisenbergParticle(_OnSheets):
 
 
 class IsokineticParticle(Heavy):
-    """A particle kept at constant speed c under gravity by a constraint that is *nonlinear* in the
-    velocities.
+    """A particle kept at constant speed c under gravity.
+
+    Its constraint is *nonlinear* in the velocities:
 
         (v.v - c^2)/(2 c) = 0,     A = v/c,     virtual velocities obey v.dv = 0
 

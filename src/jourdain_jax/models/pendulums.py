@@ -37,8 +37,9 @@ class _DoublePendulum(Heavy):
 
 
 class DoublePendulumAngles(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, described by the angles of the rods: no
-    constraints, two degrees of freedom.
+    """Planar double pendulum on massless rods, described by the angles of the rods.
+
+    The two particles have two degrees of freedom and no constraints.
 
         (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2''
                            + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
@@ -69,8 +70,9 @@ def _along(angle) -> Vector3:
 
 
 class DoublePendulumRods(_DoublePendulum):
-    """Planar double pendulum of two particles on massless rods, described by Cartesian coordinates with the
-    rods as geometric constraints.
+    """Planar double pendulum on massless rods, described by Cartesian coordinates.
+
+    The rods of the two particles are geometric constraints:
 
         |r1|^2 = l1^2,   |r2 - r1|^2 = l2^2
 
@@ -112,8 +114,9 @@ def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Partic
 
 
 class SpringAndRod(Scene):
-    """Two particles in a vertical plane. A spring connects the first to the origin, a rod the second to the
-    first.
+    """Two particles in a vertical plane, one on a spring, one on a rod.
+
+    The spring connects the first particle to the origin, the rod connects the second to the first.
 
     The force of the spring is impressed: it follows from the positions. The force of the rod follows from its
     constraint `|r2 - r1| = l`; its multiplier is the thrust in the rod, N (negative: tension). Source: Wang
@@ -166,8 +169,9 @@ class SpringAndRod(Scene):
 
 
 class PendulumChain(Heavy):
-    """A chain of n particles joined by massless rods that hangs from a pivot in a vertical plane, with n
-    geometric constraints.
+    """A chain of n particles joined by massless rods that hangs from a pivot in a vertical plane.
+
+    Each rod is a geometric constraint:
 
         |r_i - r_{i-1}|^2 = l_i^2,   r_0 = 0
 

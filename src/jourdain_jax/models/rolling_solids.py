@@ -98,8 +98,9 @@ class BallOnTurntable(Heavy):
 
 
 class Rattleback(Heavy):
-    """The rattleback (celt): an ellipsoid that rolls without slip on a level plane, with principal axes of
-    inertia turned relative to the axes of the ellipsoid.
+    """The rattleback (celt): an ellipsoid that rolls without slip on a level plane.
+
+    Its principal axes of inertia are turned relative to the axes of the ellipsoid.
 
     Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the
     body is turned by gamma about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward

@@ -121,8 +121,9 @@ class _FreeWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleFree(_FreeWheels):
-    """Two wheels on an axle down an incline, Method I: Jourdain's equation (50) for two free bodies, ten
-    constraints.
+    """Two wheels on an axle down an incline, Method I: two free bodies, ten constraints.
+
+    Equations of motion: Jourdain's equation (50).
     """
 
     def velocity_constraints(self, motion):
@@ -157,8 +158,9 @@ class _UprightWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleCoordinates(_UprightWheels):
-    """Two wheels on an axle down an incline, Method II: Appell's equations (52) in seven coordinates with the
-    five constraints (65).
+    """Two wheels on an axle down an incline, Method II: seven coordinates, five constraints (65).
+
+    Equations of motion: Appell's equations (52).
     """
 
     privileged = ("psi1_rate", "phi_rate")

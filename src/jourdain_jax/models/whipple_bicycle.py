@@ -33,8 +33,7 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class WhippleBicycle(Scene):
-    """The full nonlinear Whipple bicycle: four rigid bodies whose two wheels are knife edges that roll
-    without slip.
+    """The full nonlinear Whipple bicycle: four rigid bodies, with knife-edge wheels that do not slip.
 
     x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
 

@@ -10,14 +10,14 @@ from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.views.pictures import animate
 from jourdain_jax.views.quantities import plot
 
-# columns of the eigenvalues; weave is a complex pair, or two real ones below the double root
+# columns of the eigenvalues; weave is a complex pair, or two real eigenvalues below the double root
 _MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("weave", (2, 3), "tab:blue"))
 _CEILING = 12.0  # 1/s; castering falls far below the range of interest
 
 
 def draw_eigenvalues(study: Study, path: FilePath) -> None:
-    """Draw real and imaginary parts of the eigenvalues over forward speed. Bands span the 2.5 to 97.5 %
-    quantiles of the samples, also for the weave and capsize speeds. The stable range is green.
+    """Draw real and imaginary parts of the eigenvalues over forward speed. Bands, also those of the weave and
+    capsize speeds, span the 2.5 to 97.5 % quantiles of the samples. The stable range is green.
     """
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(

@@ -22,7 +22,7 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
     """
     found: dict[bytes, dict] = {}
     for name, contact in drawn.contacts.items():
-        # skip moving planes: either a body carries them, or they are tangent planes of an unknown ground
+        # skip moving planes: they belong to a body, or are tangent planes of an unknown ground
         if _moves(contact):
             continue
         ground = _ground(trajectory, drawn, name, contact, low, high)
@@ -80,7 +80,7 @@ def floor_under(low, high) -> float:
 
 
 def _mesh(grid: np.ndarray) -> dict:
-    """Return the triangles between neighbouring points of a grid; none has a NaN corner."""
+    """Return the triangles between neighbouring points of a grid, without those with a NaN corner."""
     triangles = quads(grid)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
     return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))]}
 

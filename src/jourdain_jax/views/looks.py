@@ -1,5 +1,5 @@
-"""Drawing of a motion: shapes of the bodies and their contacts at all saved times that were reached. A body
-without visuals has the shape of its constructor, outline, contacts or inertia.
+"""Drawings of a motion: shapes of the bodies and their contacts at all saved times that were reached. A body
+without `visuals` is drawn with the shape that its constructor, outline, contacts or inertia suggest.
 """
 
 from dataclasses import dataclass
@@ -29,14 +29,14 @@ PLAIN = "#8a8a86"  # colour of visuals that belong to no body
 
 @dataclass(frozen=True)
 class DrawnBody:
-    """Body at all times. The inertial frame is a body at rest named `""`."""
+    """A body at all drawn times. The inertial frame is drawn as a body at rest named `""`."""
 
     name: str
     colour: str
     positions: np.ndarray  # (times, 3), m
     orientations: np.ndarray  # (times, 3, 3)
     angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
-    looks: list[Visual]  # all arrays with a leading axis of times; sizes are taken at the first time
+    looks: list[Visual]  # all arrays have a leading axis of times; sizes at the first time are used
 
     def extents(self) -> np.ndarray:
         """Return points (times, points, 3) in space, m, whose bounding box contains the body."""
@@ -52,13 +52,13 @@ class DrawnBody:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Drawing of one motion."""
+    """The drawing of one motion."""
 
     ts: np.ndarray  # (times,), s; only times that were reached
     reached: np.ndarray  # indices of `ts` among all saved times
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
-    sized: bool  # whether any body has a known size; otherwise particles are sized to suit the picture
+    sized: bool  # whether any body has a known size; otherwise the picture determines the size of particles
 
     @property
     def size(self) -> float:
@@ -89,7 +89,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None
 
 
 def looks_at(scene: Scene, state: State) -> Drawn:
-    """Return the drawing of one state, without compilation."""
+    """Return the drawing of one state, computed without compilation."""
     seen = eager_if_concrete(_seen)(scene, state.t, state.q, state.u, None)
     return _drawn(
         np.asarray(state.t)[None], np.zeros(1, int), jax.tree.map(lambda x: np.asarray(x)[None], seen)
@@ -142,7 +142,9 @@ def _seen(scene, t, q, u, inputs):
 
 
 class Curved(eqx.Module):
-    """Placeholder for a ground given by a function of a point, which is evaluated again when it is drawn."""
+    """Placeholder for a ground that a function of a point defines. The function is evaluated again when the
+    ground is drawn.
+    """
 
 
 def _at(tree, index):
@@ -167,8 +169,8 @@ def _corners_of(visual: Visual) -> np.ndarray:
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
-    """Guess the shapes of a `body` without visuals that rolls on `shapes`. `dot`: radius (m) of a body
-    without size.
+    """Return shapes for a `body` without visuals, whose contacts have the rolling `shapes`. `dot`: radius (m)
+    of a body without size.
     """
     if isinstance(body, Particle):
         return [Visual.ball(dot)]
@@ -182,7 +184,7 @@ def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list
 
 
 def _solid(kind: str, corner: np.ndarray) -> Visual:
-    """Return the solid of this kind that fills a box centred at the mass centre, with this corner."""
+    """Return the solid of this kind that fills the box around the mass centre with this corner."""
     if kind == "wheel":
         return Visual.wheel(corner.max(), 2 * corner.min(), axis="xyz"[int(np.argmin(corner))])
     return Visual.box(2 * corner) if kind == "box" else Visual.ellipsoid(corner)
@@ -204,8 +206,8 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
-    """Return the uniform box of this mass and inertia, empty if its largest side is not positive. Its sides
-    follow from the principal moments A, B, C by `a^2 = 6 (B + C - A)/m`.
+    """Return the uniform box with the body's mass and inertia; empty if no side is positive. The sides follow
+    from the principal moments A, B, C by `a^2 = 6 (B + C - A)/m`.
     """
     moments, axes = np.linalg.eigh(np.asarray(body.inertia))
     mass = float(body.mass)

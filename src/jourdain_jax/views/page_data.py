@@ -1,4 +1,4 @@
-"""Data of the 3D page: a description in JSON and the array of 32-bit floats to which it refers."""
+"""Data of the 3D page: a description in JSON, and an array of 32-bit floats to which it refers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ class Numbers:
     count: int = 0
 
     def add(self, array) -> tuple[int, int]:
-        """Append an array and return its location."""
+        """Append an array and return its location (first index, count)."""
         flat = np.asarray(array, np.float32).ravel()
         self.parts.append(flat)
         self.count += flat.size
@@ -57,7 +57,7 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
     near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), everywhere))
     size, reach = (float(np.ptp(box, axis=0).max()) for box in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    # follow by default if the motion spans more than five times the size of its bodies
+    # by default, follow bodies that travel more than five times their size
     follow = (
         first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
     )
@@ -167,8 +167,8 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """Return the whole turns of a body between saved times, in addition to the shortest rotation; fast wheels
-    need them.
+    """Return the number of whole turns of a body between saved times, in addition to the shortest rotation.
+    Fast wheels make whole turns between two saved times.
     """
     if len(ts) < 2:
         return np.zeros(1)
@@ -184,12 +184,12 @@ def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray
 
 
 def _still(values: np.ndarray) -> np.ndarray:
-    """Return the values at all times, or only at the first if they are constant."""
+    """Return the values at all times, or only the first value if they are constant."""
     return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + largest(values)) else values
 
 
 def _at_rest(drawn: Drawn) -> bool:
-    """Return whether the scene has fixed visuals in the inertial frame, such as a table."""
+    """Return whether the scene has visuals that are fixed in the inertial frame, such as a table."""
     return "" in drawn.bodies and any(
         len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks
     )

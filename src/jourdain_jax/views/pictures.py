@@ -1,4 +1,4 @@
-"""Pictures of a scene's bodies with matplotlib: animations, stills, and the view of a scene in a notebook."""
+"""Pictures of a scene's bodies by matplotlib: animations, stills, and the view of a scene in a notebook."""
 
 from collections.abc import Sequence
 
@@ -41,8 +41,8 @@ def animate(
     - `frames`: maximum number of frames, taken at evenly spaced saved times. The animation lasts as long as
       the motion, but at least 2 and at most 12 s.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
-    - `follow`: move the view with the bodies instead of showing the whole path. `view`: elevation and azimuth
-      in degrees.
+    - `follow`: whether the view moves with the bodies instead of showing the whole path. `view`: elevation
+      and azimuth in degrees.
     - `title`: a line above the drawing (default: none).
 
     Raises ValueError for a suffix other than .gif or a motion that reached none of its times, and ImportError
@@ -93,8 +93,8 @@ def draw_still(
 ) -> None:
     """Draw a motion as one picture: its bodies at a few times, earlier ones paler, and the paths of points.
 
-    - `at`: times in s (the nearest saved ones are drawn), or their number, evenly spaced from the start to
-      the end.
+    - `at`: times in s (the nearest saved times are drawn), or a number of times, evenly spaced from the start
+      to the end.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
     - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
 
@@ -130,8 +130,8 @@ def scene_picture(scene) -> str:
     """Return HTML with a picture of a scene's bodies and their shadows at its `example`; empty if there are
     none.
 
-    A scene that cannot start has no picture, because notebooks also display unfinished scenes. `jj.start`
-    reports their faults.
+    A scene that cannot start has no picture: notebooks also display unfinished scenes, whose faults
+    `jj.start` reports.
     """
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)

@@ -56,17 +56,17 @@ def plot(
 ) -> tuple[Any, Any]:
     """Plot named quantities of a `motion` over time, one panel each.
 
-    - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour;
-      `labels`: their names in the legend.
+    - `motion`: a motion or rollout, or a list of several, each in its own colour; `labels`: their names in
+      the legend.
     - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"` or their sum `"energy"` (default:
-      all coordinates of the first motion). A rollout allows coordinates and speeds only. It is drawn as the
-      median of the samples still running and a band for each fraction in `bands`.
+      all coordinates of the first motion). A rollout has only coordinates and speeds. It is drawn as the
+      median of the samples still running, with a band for each fraction in `bands`.
     - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians).
       Coordinates: m, km, cm, mm, rad, mrad, deg, turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s,
       rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
     - A family (`jj.family`) is drawn against one of its quantities, named first:
       `jj.plot(turns, "x_rate", "lean")`. Stable parts are solid lines; special points are marked.
-    - `title`: default for a rollout: the number of samples that stopped or failed. `path`: file to write
+    - `title`: for a rollout, by default the number of samples that stopped or failed. `path`: file to write
       (.png, .svg, .pdf); `axes`: existing axes, one per name.
 
     Returns the matplotlib figure and an array of its axes, shape (names,). Raises KeyError for an unknown
@@ -126,7 +126,9 @@ def _plot_motions(
 
 
 def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
-    """Draw all other names against the first: stable parts solid, others dashed, special points as signs."""
+    """Draw all other names against the first. Stable parts are solid, others dashed; special points are
+    marked.
+    """
     if len(names) < 2:
         raise ValueError(
             "`plot` of a family needs a name for the horizontal axis and at least one for the "
@@ -236,7 +238,9 @@ def _scene(motion: Trajectory | Rollout):
 def _draw(
     axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str
 ) -> None:
-    """Draw a line, or the median and bands (widest, palest first) of a rollout. `y`: from `_values`."""
+    """Draw a line, or the median and bands of a rollout, widest and palest first. `y`: result of
+    `_values`.
+    """
     many = isinstance(motion, Rollout)
     ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
     if many:

@@ -20,7 +20,7 @@ from jourdain_jax.views.page_data import Display, page_data
 
 
 class View:
-    """3D view of motions as an HTML page, `html`. It displays itself in a notebook; `save(path)` writes it to
+    """A 3D view of motions as an HTML page, `html`. A notebook displays it; `save(path)` writes it to
     a file.
     """
 
@@ -55,18 +55,20 @@ def show(
 ) -> View:
     """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
-    - `motion`: from `jj.simulate`; or a list of motions, or a rollout (at most 12 samples, evenly spaced),
-      drawn over each other, all but the first translucent.
+    - `motion`: from `jj.simulate`; or a list of motions, or a rollout (at most 12 samples, evenly spaced).
+      Several motions are drawn over each other, all but the first translucent.
     - `path`: an .html file to write as well. `ride.html#t=2.5` opens at 2.5 s.
-    - `how`, by name: `title`: default: the name of the scene. `height`: height in pixels in a notebook (480).
-    - `play`: start playing when opened.
-    - `follow`: move the view with the bodies (default: if they travel far). `view`: initial elevation and
-      azimuth, in degrees (default: (22, -60)).
+    - Keyword arguments `how`: `title` (default: the name of the scene); `height` in pixels in a notebook
+      (480).
+    - `play`: whether to play when opened.
+    - `follow`: whether the view moves with the bodies (default: if they travel far). `view`: initial
+      elevation and azimuth, in degrees (default: (22, -60)).
     - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres if there
       is no contact).
-    - `forces`: draw arrows for the contact forces (default: True). `colours`: name of a body -> "#rrggbb".
+    - `forces`: whether to draw arrows for contact forces (default: True). `colours`: name of a body ->
+      "#rrggbb".
 
-    Bodies look as the scene's `visuals` define (see `jj.Visual`), otherwise as guessed from their shapes and
+    Bodies have the shapes of the scene's `visuals` (see `jj.Visual`), or shapes that follow from contacts and
     inertias. Returns a `View`. Raises ValueError for invalid arguments.
 
     **Examples**

@@ -1,4 +1,4 @@
-"""Shapes as quadrilateral faces; a triangle repeats its last corner."""
+"""Shapes as quadrilateral faces. A triangle is a face whose last two corners are equal."""
 
 from itertools import pairwise
 
@@ -12,10 +12,10 @@ Quads = Float[np.ndarray, "faces 4 3"]  # m; corners counterclockwise as seen fr
 
 
 def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
-    """Return the faces of a shape at time index `k` and their darkness, 0 to 1. Faces are in the shape's own
-    axes, lines in the body frame.
+    """Return the faces of a shape at time index `k` and their darkness, 0 to 1, in the shape's own axes; a
+    line is in the body frame.
 
-    `thin`: radius (m) of lines that specify none.
+    `thin`: radius (m) of lines without a radius.
     """
     size, dark = np.asarray(visual.size)[0], np.zeros(())
     if visual.kind == "line":
@@ -62,7 +62,7 @@ def revolved(profile: Float[np.ndarray, "rows 2"], around: int) -> Float[np.ndar
 
 
 def triangles_of(mesh: Visual) -> Quads:
-    """Return the faces of a mesh, each polygon split into a fan of triangles."""
+    """Return the faces of a mesh, in which each polygon is split into a fan of triangles."""
     assert mesh.faces is not None
     return mesh.faces.corners[
         [(p[0], p[k], p[k + 1], p[k + 1]) for p in mesh.faces.polygons for k in range(1, len(p) - 1)]
@@ -96,8 +96,8 @@ def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
 
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:
-    """Divide faces into parts with edges of at most about `longest`, which makes sorting by depth accurate.
-    Return the parts and the face index of each part.
+    """Divide faces into parts with edges of at most about `longest`, so that sorting by depth is accurate.
+    Return the parts, and the index of the face to which each part belongs.
     """
     # edge k runs from corner k - 1 to corner k
     edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)

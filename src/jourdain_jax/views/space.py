@@ -16,7 +16,9 @@ _INK = "#444444"  # colour of paths
 
 
 def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
-    """Return the faces and colours of all bodies at time index `k`; `strength` below 1 makes them paler."""
+    """Return the faces and colours of all bodies at time index `k`. A `strength` below 1 makes
+    colours paler.
+    """
     corners, colours, size = [], [], drawn.size
     for body in drawn.bodies.values():
         for look in body.looks:
@@ -55,7 +57,7 @@ def box_of(faces: Sequence[np.ndarray]) -> Float[np.ndarray, "2 3"]:
 
 
 def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, float, float] | None = None):
-    """Return 3D axes of a matplotlib figure, seen from this elevation and azimuth (degrees). The axis along
+    """Return 3D axes in a matplotlib figure, viewed from this elevation and azimuth (degrees). The axis along
     the line of sight is hidden. Without `place`, the axes have no numbers.
     """
     axes = figure.add_subplot(projection="3d", proj_type="ortho", computed_zorder=False)
@@ -78,8 +80,8 @@ def axes_in_space(figure, view: tuple[float, float], place: tuple[float, float, 
 
 
 def draw(axes, bodies: Painted, paths: Sequence[np.ndarray], box: Float[np.ndarray, "2 3"]) -> None:
-    """Replace the drawing by bodies with shadows and by paths (times, 3). `box`: lowest and highest corners
-    of the visible region.
+    """Clear the axes and draw bodies with shadows, and paths (times, 3). `box`: lowest and highest corners of
+    the visible region.
     """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
