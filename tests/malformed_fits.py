@@ -62,7 +62,7 @@ FITS: dict[str, str] = {
     "jj.fit(cart, run(start={'y': 0.0}), 'mass')": "no coordinate or speed `y`",
     "jj.fit(cart, run(inputs={'pus': 1.0}), 'mass')": "no input `pus`; did you mean `push`",
     "jj.fit(cart, run(values={'x': TS[:5]}, sigma=1.0), 'mass')": "shape (5,), expected (21,) for 21 times",
-    "jj.fit(cart, run(values={'x': np.ones((3, 21))}, sigma=1.0), 'mass')": "many repeats go to `fit_batch`",
+    "jj.fit(cart, run(values={'x': np.ones((3, 21))}, sigma=1.0), 'mass')": "repeats use `fit_batch`",
     "jj.fit(cart, run(sigma={'x': np.ones(5), 'x_rate': 1.0}), 'mass')": (
         "sigma of channel `x` ... shape (5,)"
     ),
@@ -84,7 +84,7 @@ FITS: dict[str, str] = {
     "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds only NaN",
     "jj.fit(cart, run(), 'mass', errors='hac')": "`errors` is 'hac', expected",
     "jj.fit(cart, run(), 'mass', errors='runs')": (
-        "from the differences between runs, but there are 1; give 5 or more"
+        "from differences between runs, but there are only 1; give 5 or more"
     ),
     "jj.fit(cart, run(sigma={'x': None, 'x_rate': 1.0}), 'mass', loss=jj.identification.huber())": (
         "sigma of channel `x` is None, but a robust loss"
@@ -230,7 +230,7 @@ SENSORS: dict[str, str] = {
     "fitted(gain=[1.0, 2.0])": "`gain` of sensor `gyro` of run 0 of `Cart` has shape (2,), expected () or ()",
     "fitted(lag=jj.Estimate(0.0))": "first guess of `gyro.lag` is 0.0; expected a first guess above zero",
     "jj.fit(cart, [shown(gain=gain), shown(gain=jj.Estimate(2.0))], 'mass')": (
-        "run 0 and run 1 share `gyro.gain` but state it differently ... ; give both the same, or"
+        "run 0 and run 1 share `gyro.gain` but define it differently ... ; give both the same, or"
         " `per_run=True`"
     ),
     "jj.identification.log_likelihood(cart, shown(gain=gain))": (

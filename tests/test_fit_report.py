@@ -195,7 +195,7 @@ def test_many_long_runs_stay_below_two_megabytes(tmp_path):
     fit.report(tmp_path / "fit.html", runs[:30], held_out=measured(40))
     assert (tmp_path / "fit.html").stat().st_size < 2e6
     # span, eight runs of thirty, two channels, priors
-    assert len(sections(tmp_path / "fit.html")["What informs which unknown"]["unknown"]) == 1 + 8 + 2 + 1
+    assert len(sections(tmp_path / "fit.html")["Information on each unknown"]["unknown"]) == 1 + 8 + 2 + 1
     assert "20 more are not drawn" in (tmp_path / "fit.html").read_text(encoding="utf-8")
 
 
@@ -222,7 +222,7 @@ def test_report_tells_the_way_to_the_minimum(tmp_path):
     fit.report(tmp_path / "fit.html")
     text = (tmp_path / "fit.html").read_text(encoding="utf-8")
     assert f"{int(fit.agreeing)} of 4 first guesses led to this minimum" in text
-    assert sections(tmp_path / "fit.html")["The way to the minimum"]["whole runs"][0] == str(int(fit.steps))
+    assert sections(tmp_path / "fit.html")["Path to the minimum"]["whole runs"][0] == str(int(fit.steps))
 
 
 def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
@@ -249,7 +249,7 @@ def test_names_that_no_data_tell_stand_in_the_report(tmp_path, drawn):
     assert "`inertia` and `mass` are not determined separately" in text
     assert any(text.get_text() == "not determined" for text in drawn[0].axes[0].texts)
     assert "profile flat" in text
-    assert list(sections(tmp_path / "fit.html")["What informs which unknown"]) == ["unknown", "offset"]
+    assert list(sections(tmp_path / "fit.html")["Information on each unknown"]) == ["unknown", "offset"]
 
 
 def test_a_notebook_shows_how_well_each_unknown_is_known(fitted, drawn):
@@ -358,7 +358,7 @@ def test_profiles_answer_wrong_names_and_other_data():
         fit.profiles(run(unknown=()))
 
 
-# What informs which unknown. --------------------------------------------------------------------------------
+# Information on each unknown. -------------------------------------------------------------------------------
 
 
 def shares(fit, runs):

@@ -387,7 +387,7 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
     ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.6, 2.6, 10.0]))
     with pytest.warns(
         UserWarning,
-        match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s",
+        match="`push` of run 1 does not cover the whole run and keeps its last value from 1 to 4 s",
     ) as seen:
         found = fit(Cart(mass=1.7), [cart_run(), cart_run(inputs=ends)], ("mass",))
     assert len(seen) == 1

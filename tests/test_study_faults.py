@@ -252,7 +252,7 @@ def test_a_folder_that_holds_another_study_is_refused_and_left_alone(change, nam
         return {file: file.read_bytes() for file in sorted(whole.store.path.rglob("*")) if file.is_file()}
 
     before = content()
-    with pytest.raises(ValueError, match="holds another study") as caught:
+    with pytest.raises(ValueError, match="contains another study") as caught:
         change(whole.store.path)
     assert named in str(caught.value)
     assert content() == before
@@ -266,7 +266,7 @@ def test_an_option_is_not_named_for_the_place_of_a_function_in_memory(tmp_path):
         )
 
     study()
-    with pytest.raises(ValueError, match=r"different are options \(`rtol`\); give"):
+    with pytest.raises(ValueError, match=r"with different options \(`rtol`\); give"):
         study(rtol=1e-6)
 
 

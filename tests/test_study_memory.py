@@ -92,7 +92,7 @@ def test_too_little_is_refused_before_anything_is_written(tmp_path):
         ValueError, match="`memory` allows 100 MB for each computing process, but this process holds"
     ):
         run(tmp_path / "discs.zarr", memory="100MB")
-    with pytest.raises(ValueError, match="a new process holds 240 MB before it begins"):
+    with pytest.raises(ValueError, match="a new process uses 240 MB before the study begins"):
         run(tmp_path / "discs.zarr", memory="1GB", processes=4)
     assert not (tmp_path / "discs.zarr").exists()
 

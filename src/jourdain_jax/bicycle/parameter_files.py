@@ -220,8 +220,8 @@ def entries(
 
 
 def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, float | None]:
-    """Return the finite number in `text` and its sigma (None if not given); `name` and `what` ("value" or
-    "reading") are for the message.
+    """Return the finite number in `text` and its sigma (None if not given). `name` and `what` ("value" or
+    "reading") appear in error messages.
     """
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or omit this bicycle."

@@ -272,7 +272,7 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     if repeats:
         counts = {values.shape[0] for run in runs for values in run.values.values()}
         if len(counts) != 1 or 0 in counts:
-            said = "give every channel of every run the same leading axis, of one or more"
+            said = "give every channel of every run a leading axis of the same length, one or more"
             raise ValueError(f"the channels hold {sorted(counts)} repeats; {said}")
         members = counts.pop()
     enough = _check_enough(runs, unknowns, repeats)
@@ -305,8 +305,8 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
 def _check_control(control: Control) -> None:
     if not 0 < control.cutoff < 1:
         raise ValueError(
-            f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of "
-            "the largest singular value that counts as zero"
+            f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the fraction of the "
+            "largest singular value below which others count as zero"
         )
     if not control.tolerance > 0:
         raise ValueError(
@@ -319,8 +319,8 @@ def _check_control(control: Control) -> None:
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
     if asked.errors == "runs" and len(runs) < 5:
         raise ValueError(
-            'errors="runs" takes standard errors from the differences between runs, but there '
-            f'are {len(runs)}; give 5 or more, or errors="sigmas"'
+            'errors="runs" computes standard errors from differences between runs, but there are '
+            f'only {len(runs)}; give 5 or more, or errors="sigmas"'
         )
     robust = asked.loss != LEAST_SQUARES
     unknown = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)

@@ -28,7 +28,7 @@ def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
 
 
 def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
-    """Return the rotation of a quaternion (w, x, y, z) of any norm; NaN for zero."""
+    """Return the rotation of a quaternion (w, x, y, z) of any norm; NaN for the zero quaternion."""
     return Rotation.from_quat(np.roll(q, -1)).as_matrix() if np.any(q) else np.full((3, 3), np.nan)
 
 

@@ -147,7 +147,7 @@ def _constant(system: MechanicalSystem, matrix, what: str):
 
 
 def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
-    """Raise ValueError if the stated angular velocity is not the rate of the orientation."""
+    """Raise ValueError if SymPy's angular velocity is not the rate of the orientation."""
     if pose.frame is None:
         return
     name, stated = f"orientation of body `{pose.name}`", f"angular velocity of body `{pose.name}`"

@@ -55,7 +55,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Link:
-    """One link. Several joints act in sequence; without joints it is fixed to its parent."""
+    """A link. Its joints act in sequence; without joints it is fixed to its parent."""
 
     name: str
     parent: str | None  # None: the inertial frame

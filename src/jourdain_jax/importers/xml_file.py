@@ -38,7 +38,7 @@ class Holds:
 
 
 class XmlFile:
-    """A robot file during reading: its root, its location, and omitted parts."""
+    """A robot file that is being read: its root element, its location, and omitted parts."""
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
         """Read the file at `path`, or the text `path` itself. `table`: the permitted contents of each
@@ -130,7 +130,7 @@ class XmlFile:
                 )
 
     def leave_out(self, what: str) -> None:
-        """Record an omitted element without effect on the motion, or ignored by the user."""
+        """Record an omitted element, which has no effect on the motion or is ignored by the user."""
         self._left_out[what] += 1
 
     def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
@@ -161,7 +161,7 @@ class XmlFile:
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
-        """Raise ValueError with the text `what`, unless the name is among the valid ones."""
+        """Raise ValueError with the text `what` unless the name is one of the `valid` names."""
         check_name(name, valid, f"{self.source}: {what}")
 
     def named(self, kind: str) -> "dict[str, Part]":
@@ -193,7 +193,7 @@ class Part:
     def __init__(
         self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None
     ):
-        """Store the element; `attributes` replaces its own attributes."""
+        """Store the element. `attributes`: used in place of the element's own attributes, if given."""
         self.file, self.what, self.element = file, what, element
         self.given: Mapping[str, str] = attributes or ({} if element is None else element.attrib)
 

@@ -27,7 +27,7 @@ class Skate(Scene):
     A turning skate drifts across the slope, not downhill. Neither xdot nor ydot can be privileged at every
     heading. Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972), ch. III.
 
-    x, y of the mass centre, heading of the blade.
+    Coordinates: x, y of the mass centre, heading of the blade.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -77,7 +77,8 @@ class ChaplyginSleigh(Scene):
     and a, but not m and I separately. Source: S. A. Chaplygin (1911); A. M. Bloch, Nonholonomic Mechanics and
     Control (2003), section 1.7.
 
-    x, y of the mass centre, heading of the blade; the blade touches the ice at body point (-offset, 0, 0).
+    Coordinates: x, y of the mass centre, heading of the blade. The blade touches the ice at the body point
+    (-offset, 0, 0).
     """
 
     mass: Parameter = parameter(1.3, unit="kg", positive=True)
@@ -142,14 +143,14 @@ class Snakeboard(Scene):
         -sin(heading +- steer) xdot + cos(heading +- steer) ydot +- l cos(steer) headingdot = 0
                                                                              (front: +, back: -)
 
-    Two constraints, three degrees of freedom. At steer = +-pi/2 the constraints are parallel and the rank
-    drops from 2 to 1. Motions pass smoothly: without torques the forward speed is c l cos(steer)/D and the
-    turn rate c sin(steer)/D, with a constant c and D^2 = m l^2 cos^2(steer) + (J + 2 Jw) sin^2(steer).
-    Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. Robotics and Automation
-    (1994) 2391.
+    Two constraints leave three degrees of freedom. At steer = +-pi/2 the constraints are parallel and the
+    rank drops from 2 to 1, but motions pass smoothly: without torques the forward speed is c l cos(steer)/D
+    and the turn rate c sin(steer)/D, with a constant c and D^2 = m l^2 cos^2(steer) + (J + 2 Jw)
+    sin^2(steer). Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. Robotics and
+    Automation (1994) 2391.
 
-    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels (the
-    back wheels steer by -steer).
+    Coordinates: x, y of the board's middle, heading; rotor angle relative to the board; steer of the front
+    wheels (the back wheels steer by -steer).
 
     Inputs (N m): `rotor_torque` between rotor and board, `steer_torque` that opens both wheel pairs.
     """
@@ -213,12 +214,12 @@ class TrailerChain(Scene):
         gamma_i' = w_{i-1} - (v_{i-1}/L) sin(gamma_i),   gamma_i = heading_{i-1} - heading_i
         v_i = v_{i-1} cos(gamma_i),   w_i = (v_{i-1}/L) sin(gamma_i)
 
-    Coordinates are maximal: x, y of the axle and heading of every body. Each constraint then couples only two
-    neighbours, and A is banded; in minimal coordinates (x, y, n + 1 headings) every trailer's constraint
-    would contain all headings ahead of it. The speeds are each body's own forward, sideways and turning
-    velocity, so that the car's forward speed and turn rate are privileged at any heading. The hitch pulls at
-    the car's mass centre: without torque the car's turn rate is constant. Source: J.-P. Laumond, Proc. IEEE
-    Int. Conf. Intelligent Robots and Systems (1993) 1033; O. J. Sordalen, ICRA (1993) 1983.
+    Coordinates are x, y of the axle and heading of every body. Each constraint then couples only two
+    neighbours, and A is banded; with fewer coordinates (x, y, n + 1 headings) every trailer's constraint
+    would contain all headings ahead of it. Speeds are the forward, sideways and turning velocity of every
+    body, so that those of the car can be privileged at any heading. The hitch pulls at the car's mass centre:
+    without torque the car's turn rate is constant. Source: J.-P. Laumond, Proc. IEEE Int. Conf. Intelligent
+    Robots and Systems (1993) 1033; O. J. Sordalen, ICRA (1993) 1983.
 
     Body 0 is the car, bodies 1 to n are the trailers; mass centres are on the axles. A trailer parameter is
     one number for all trailers, or one number for each.

@@ -23,7 +23,8 @@ class VerticalDisc(Heavy):
 
     Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.4.
 
-    x, y of the contact point (and of the centre), heading about the vertical, roll about the axle.
+    Coordinates: x, y of the contact point (and of the centre), heading about the vertical, roll about the
+    axle.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -79,12 +80,12 @@ class TiltingDisc(_ThinDisc):
 
     This is the classic problem of Appell and Korteweg.
 
-    Contact and height are built into the coordinates (x, y: contact point). Two no-slip constraints, three
-    degrees of freedom. The coordinates are singular where the disc lies flat (lean = +-pi/2); use
-    `TiltingDiscQuaternion` near that position. Source: Wang and Pao (2003), section V; J. I. Neimark and N.
-    A. Fufaev, Dynamics of Nonholonomic Systems (1972).
+    Contact and height are built into the coordinates. Two no-slip constraints leave three degrees of freedom.
+    The coordinates are singular where the disc lies flat (lean = +-pi/2); use `TiltingDiscQuaternion` near
+    that position. Source: Wang and Pao (2003), section V; J. I. Neimark and N. A. Fufaev, Dynamics of
+    Nonholonomic Systems (1972).
 
-    Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point.
+    Coordinates: x, y of the contact point; yaw about z, lean about the heading, spin about the axle.
     """
 
     coordinates = coordinates("x y yaw lean spin")
@@ -117,11 +118,11 @@ class TiltingDiscQuaternion(_ThinDisc):
 
     One height constraint and two no-slip constraints on six speeds leave three degrees of freedom, with the
     motion of `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc
-    lies flat, where the contact point itself is undefined. Source: Wang and Pao (2003), section V; R. Cushman
-    and J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
+    lies flat and the contact point is undefined. Source: Wang and Pao (2003), section V; R. Cushman and J. J.
+    Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
 
-    Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is
-    body axis y.
+    Coordinates: x, y, z of the centre, attitude as a quaternion. Speeds: x_rate, y_rate, z_rate, body angular
+    velocity. The axle is body axis y.
     """
 
     coordinates = coordinates("x y z", quaternion("attitude"))

@@ -100,7 +100,7 @@ class IsokineticParticle(Heavy):
     gd(tau), z = -(c^2/g) ln cosh(tau). Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983)
     1016 (the Gaussian isokinetic thermostat).
 
-    Motion in a vertical plane, x horizontal and z up.
+    Coordinates: x horizontal and z up, in a vertical plane.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)

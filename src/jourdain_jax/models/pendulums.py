@@ -48,7 +48,7 @@ class DoublePendulumAngles(_DoublePendulum):
     The same system as `DoublePendulumRods`. Source: L. D. Landau and E. M. Lifshitz, Mechanics, section 5,
     problem 1.
 
-    Angles of the upper and the lower rod from straight down; pivot at the origin.
+    Coordinates: angles of the upper and the lower rod from straight down. The pivot is at the origin.
     """
 
     coordinates = coordinates("theta1 theta2")
@@ -79,7 +79,7 @@ class DoublePendulumRods(_DoublePendulum):
     The same system as `DoublePendulumAngles`, which has no constraints. Multipliers are the thrusts in the
     rods, N (negative: tension).
 
-    Cartesian coordinates of both particles; pivot at the origin.
+    Coordinates: x, z of both particles. The pivot is at the origin.
     """
 
     coordinates = coordinates("x1 z1 x2 z2")
@@ -122,8 +122,8 @@ class SpringAndRod(Scene):
     constraint `|r2 - r1| = l`; its multiplier is the thrust in the rod, N (negative: tension). Source: Wang
     and Pao (2003), section I.
 
-    Cartesian coordinates of both particles, in the order origin, spring (and damper), first particle, rod,
-    second particle.
+    Coordinates: x, z of both particles. A spring (with damper) connects origin and first particle, a rod both
+    particles.
     """
 
     mass1: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -179,7 +179,7 @@ class PendulumChain(Heavy):
     the mass matrix in angles would be dense. n = 2 is the double pendulum. Multipliers are the thrusts in the
     rods, N (negative: tension).
 
-    Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per
+    Coordinates: x, z of all particles, from the pivot down. Masses and lengths are one number, or one per
     link.
     """
 

@@ -31,8 +31,8 @@ class BallOnTurntable(Heavy):
     table. With these the constraints have constant coefficients and do not depend on the attitude, a
     quaternion needed only for drawing. Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
 
-    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the axes
-    of the table.
+    Coordinates: x, y of the centre along the table, and the attitude. Speeds: x_rate, y_rate, and the angular
+    velocity roll_x, roll_y, spin in the axes of the table.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -102,19 +102,18 @@ class Rattleback(Heavy):
 
     Its principal axes of inertia are turned relative to the axes of the ellipsoid.
 
-    Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the
-    body is turned by gamma about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward
-    vertical in body axes. At the contact point the outward normal is mu. The vector from the mass centre to
-    this point is, with the depth h of the mass centre below the ellipsoid's centre,
+    Space axes n1 and n2 are level, n3 points DOWN. Body axes are the axes of the ellipsoid, with axis 3 down
+    at zero angles; the body is turned by gamma about 3, alpha about 1, beta about 2, in this order. mu = R'
+    n3 is the downward vertical in body axes. At the contact point the outward normal is mu. The vector from
+    the mass centre to this point is, with the depth h of the mass centre below the ellipsoid's centre,
 
         rho = S mu / sqrt(mu . S mu) - h e3,   S = diag(a^2, b^2, c^2)
 
-    The height of the mass centre, rho . mu, is built into the coordinates; no slip gives two constraints. The
-    speeds are the mass centre's level velocities and the body angular velocity (w1, w2, w3): three degrees of
-    freedom. Source: T. R. Kane and D. A. Levinson, Int. J. Non-Linear Mech. 17 (1982) 175.
+    The height of the mass centre, rho . mu, is built into the coordinates. Two no-slip constraints leave
+    three degrees of freedom. Source: T. R. Kane and D. A. Levinson, Int. J. Non-Linear Mech. 17 (1982) 175.
 
-    x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha =
-    +-pi/2.
+    Coordinates: x, y of the mass centre; angles alpha, beta, gamma, singular at alpha = +-pi/2. Speeds:
+    x_rate, y_rate, and the body angular velocity w1, w2, w3.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)

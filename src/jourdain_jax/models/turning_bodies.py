@@ -19,8 +19,8 @@ class FreeRigidBody(Scene):
     middle axis is unstable. Source: L. Euler (1758); L. D. Landau and E. M. Lifshitz, Mechanics, section 37;
     Wang and Pao (2003), eq. (48).
 
-    Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are
-    principal.
+    Coordinates: position of the mass centre, attitude as a quaternion. Speeds: rate of the position, body
+    angular velocity. Body axes are principal axes.
     """
 
     mass: Parameter = parameter(1.0, unit="kg", positive=True)
@@ -62,8 +62,8 @@ class Suslov(Scene):
     Source: G. K. Suslov, Theoretical Mechanics (1902); V. V. Kozlov, Regular and Chaotic Dynamics 7 (2002)
     161.
 
-    Attitude as a quaternion; speeds are the body angular velocity. Moments of inertia are about the fixed
-    point, which is the mass centre.
+    Coordinates: attitude as a quaternion. Speeds: body angular velocity. Moments of inertia are about the
+    fixed point, which is the mass centre.
     """
 
     i11: Parameter = parameter(1.0, unit="kg m^2", positive=True)

@@ -2,8 +2,8 @@
 
 Rear wheel R, rear frame with rider B, front frame (handlebar and fork) H, front wheel F. The rear contact and
 its height are built into the coordinates; the front contact is the lowest point of the front wheel, with a
-height constraint and two no-slip constraints, valid at any lean and steer. Five constraints, three degrees of
-freedom: lean, steer, forward motion.
+height constraint and two no-slip constraints, valid at any lean and steer. Five constraints leave three
+degrees of freedom: lean, steer, forward motion.
 
 Parameters have the source's names and frame: origin at the rear contact, x forward, y to the right, z DOWN.
 The engine's frame has y to the left and z up, rotated by half a turn about x: `(x, y, z) -> (x, -y, -z)`, so
@@ -35,7 +35,8 @@ from jourdain_jax.scene.visuals import Visual
 class WhippleBicycle(Scene):
     """The full nonlinear Whipple bicycle: four rigid bodies, with knife-edge wheels that do not slip.
 
-    x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
+    Coordinates: x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels
+    relative to their frames.
 
     Inputs, both positive to the right (N m): `lean_torque`, an external torque on the rear frame about the
     level line through the rear contact; `steer_torque` on the front frame about the steer axis, with its

@@ -35,7 +35,8 @@ class Design(Printed):
     - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); not for grids and
       tables.
     - `samples`: number of samples. A grid has all combinations of its levels, a table one sample per row.
-      `seed`: sample k depends only on the seed and k (in a Latin hypercube also on the number of samples).
+    - `seed`: seed of the random numbers. Sample k depends only on the seed and k (in a Latin hypercube also
+      on the number of samples).
     - `correlation`: pair of names -> correlation coefficient of two normal distributions; of other
       distributions, the correlation of the normal scores of their ranks.
 

@@ -56,7 +56,9 @@ class Distribution:
     @staticmethod
     @abstractmethod
     def _inverse(u: np.ndarray, first, second) -> np.ndarray:
-        """Return the values at `u`, an analytic function of the two numbers."""
+        """Return the values at the probabilities `u`. The result is an analytic function of the numbers
+        `first` and `second`.
+        """
 
 
 @dataclass(frozen=True)

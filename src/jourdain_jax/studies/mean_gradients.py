@@ -42,8 +42,8 @@ class MeanGradients(Printed):
       number of a distribution, such as "radius.sigma"; "radius.shift" shifts all values of a table or grid by
       the same amount.
     - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the
-      output over the unit of the number. Standard errors assume independent samples (a Sobol sequence or a
-      Latin hypercube has smaller ones). NaN where the derivative does not exist.
+      output over the unit of the number. Standard errors assume independent samples; those of a Sobol
+      sequence or a Latin hypercube are smaller. Entries are NaN where the derivative does not exist.
     - `lanes`: the number of samples with a value of each output; `failed`: the number of failed motions,
       which are omitted; `warnings`: reasons to doubt the numbers.
     """
@@ -185,13 +185,13 @@ def _gathered(
             none = ", ".join(name for name, is_one in zip(task.outputs, of_event, strict=True) if is_one)
             warned.append(
                 f"the event at which a sample ends depends on the varying quantities: the means of {none} "
-                "have no pathwise derivative; take differences"
+                "have no pathwise derivative; use differences"
             )
         if not of_event.all():
             warned.append(
                 f"{int(np.sum(ends >= 0))} of {len(values)} samples end at an event, others at another event "
-                "or at none: if an output jumps between these ends, the gradient lacks the change of their "
-                "shares; compare with differences of the mean"
+                "or at none: if an output differs between these groups, the gradient lacks the effect of "
+                "samples that change groups; compare with differences of the mean"
             )
     for text in warned:
         warn(text, SensitivityWarning)

@@ -59,8 +59,8 @@ def room(allowed: int, *, here: bool) -> float:
     give_back_at_once()
     if allowed < held + COMPILED:
         need = (
-            f"{'this process' if here else 'a new process'} holds {held / 1e6:.0f} MB before it begins, and"
-            f" compiling may take {COMPILED / 1e6:.0f} MB"
+            f"{'this process' if here else 'a new process'} uses {held / 1e6:.0f} MB before the study begins,"
+            f" and compiling may take {COMPILED / 1e6:.0f} MB"
         )
         raise ValueError(
             f"`memory` allows {allowed / 1e6:.0f} MB for each computing process, but {need}; "

@@ -270,8 +270,8 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         was, now = store.attributes, json.loads(json.dumps(attributes(task)))
         what = ", ".join(_difference(name, was, now) for name in other)
         raise ValueError(
-            f"`{store.path}` holds another study; different are {what}; give a new folder, or "
-            "the arguments of that study"
+            f"`{store.path}` contains another study, with different {what}; give a new folder, "
+            "or the arguments of that study"
         )
     if chunk is not None and chunk != store.chunk:
         raise ValueError(

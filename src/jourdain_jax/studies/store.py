@@ -211,7 +211,7 @@ class Store:
         return json.loads(self._read("zarr.json"))["attributes"]
 
     def lanes_of(self, numbers: Sequence[int]) -> str:
-        """Return a text that names the samples of chunks."""
+        """Return a text with the sample numbers of some chunks."""
         spans = (f"{first} to {last - 1}" for first, last in map(self.span, numbers[:5]))
         return f"samples {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
 

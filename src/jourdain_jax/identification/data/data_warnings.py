@@ -52,8 +52,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
         spans.append(f"its last value from {ts[-1]:.6g} to {end:.6g} s")
     if spans:
         yield (
-            f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if this is right, "
-            "add a sample with that value, otherwise give more samples, or shorter measurements"
+            f"{what} does not cover the whole run and keeps {' and '.join(spans)}; if this is intended, add "
+            "a sample with that value; otherwise give more samples, or a shorter run"
         )
     usual = float(np.median(intervals))
     (gaps,) = np.nonzero((intervals > 5.0 * usual) & (ts[:-1] < end) & (ts[1:] > begin))  # missing intervals
@@ -63,7 +63,7 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
         more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
         yield (
             f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, "
-            "where it is interpolated linearly; if this is wrong, give the samples, or shorter measurements"
+            "where it is interpolated linearly; if this is wrong, add samples, or give a shorter run"
         )
 
 
@@ -79,6 +79,6 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
     if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
         yield (
-            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn, as "
-            "a wrapped angle; coordinates are continuous: apply `np.unwrap`"
+            f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn, "
+            "like a wrapped angle; coordinates are continuous: apply `np.unwrap`"
         )

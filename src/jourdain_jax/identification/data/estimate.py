@@ -103,7 +103,7 @@ class Range:
         if np.all((self.low < guess) & (guess < self.high)):
             return ""
         if self.kind == "positive":
-            return "expected a first guess above zero; or let it change sign with `unbounded()`"
+            return "expected a first guess above zero; for an unknown of any sign use `unbounded()`"
         return (
             f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen"
             " the bounds"

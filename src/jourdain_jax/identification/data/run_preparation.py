@@ -41,7 +41,7 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
         shape = (times, *shape)
         if (values.shape[1:] if repeats else values.shape) != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
-            hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
+            hint = "; for many repeats use `fit_batch`" if values.shape[1:] == shape and not repeats else ""
             hint = "; take its only column, `[:, 0]`" if values.shape == (*shape, 1) else hint
             raise ValueError(
                 f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for "

@@ -177,7 +177,7 @@ def _informed(shares: Informed) -> Section:
         rows.append((name, *parts, f"run {run}, {begin:.3g} to {end:.3g} s"))
     more = shares.of_runs.shape[1] - len(shown)
     note = [f"The {len(shown)} most informative runs are shown; {more} more are not."] if more else []
-    return Section("What informs which unknown", about, table(rows) + note)
+    return Section("Information on each unknown", about, table(rows) + note)
 
 
 def _correlations(fit: Estimates) -> Section:
@@ -246,4 +246,4 @@ def _way(fit: Estimates) -> Section:
         told = "one first guess was tried; `guesses=30` would show how many lead here"
     rows = [("objective", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
-    return Section("The way to the minimum", told, table(rows))
+    return Section("Path to the minimum", told, table(rows))

@@ -31,7 +31,9 @@ def warnings_of(fit: Estimates) -> Sentences:
 
 
 def _of_the_minimum(fit: Estimates) -> Iterator[str]:
-    """Yield warnings if no minimum was found, or if bounds or missing degrees of freedom determine it."""
+    """Yield warnings if no minimum was found, if it lies at a bound, or if a channel has no degrees of
+    freedom left.
+    """
     if fit.stuck:
         yield (
             "no step improves the fit, but this is no minimum: nearby the motion fails, or is rougher than "
@@ -93,7 +95,7 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
     sizes, sure = _sizes_of_residuals(fit), 5.0
     coloured = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
     if large := [size for size in sizes if size.least > _by_chance(size.narrow, sure)]:
-        why = "a local minimum (use another first guess), a wrong scene, or sigmas that are too small"
+        why = "this is a local minimum (use another first guess), the scene is wrong, or sigmas are too small"
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
     def larger(channels: list[str]) -> float:

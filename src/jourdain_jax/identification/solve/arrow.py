@@ -69,7 +69,7 @@ class ByMember:
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
-    """Return T of [J r]; not finite if [J r] is not."""
+    """Return the triangle T of Jacobian and residuals [J r]; not finite if these are not."""
     width = whole.shape[-1]
     if whole.shape[-2] < width:
         whole = np.concatenate(

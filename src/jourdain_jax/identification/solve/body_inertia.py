@@ -181,13 +181,13 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
 
 
 def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
-    """Return entries of the diagonal, and of the products 12, 23, 13."""
+    """Return the entries of the inertia matrix: its diagonal, and its products 12, 23, 13."""
     known = {of: placed.body for of, placed in pose_at(scene, 0.0, scene.named()[0]).bodies.items()}
-    what = f"`free` asks for a possible inertia of `{name}`, which is not a body of `{type(scene).__name__}`"
+    what = f"`free` has a possible inertia for `{name}`, which is not a body of `{type(scene).__name__}`"
     check_name(name, known, what)
     if not isinstance(known[name], RigidBody):
         raise ValueError(
-            f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name a rigid body"
+            f"`free` has a possible inertia for `{name}`, but this is a particle; name a rigid body"
         )
     names = [
         of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)

@@ -39,7 +39,8 @@ class Linearised(ByMember):
     # residuals of all samples, not whitened, by (member, run); None if another run has failed
     residuals: np.ndarray
     sigma: Float[np.ndarray, "members channels"]  # of channels with estimated noise
-    # triangles of [J r]: first for all channels with known sigma, then for each other channel
+    # triangles of Jacobian and residuals [J r]: first for all channels with known sigma, then for each other
+    # channel
     triangles: Float[np.ndarray, "members runs kinds width width"]
     squares: Float[np.ndarray, "members kinds"]  # sums of their squared residuals
 

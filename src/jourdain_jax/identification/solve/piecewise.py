@@ -53,7 +53,8 @@ class _Standing(ByMember):
     # unknowns of each piece, with its start state (node)
     local: Float[np.ndarray, "members pieces states_and_own"]
     theta: Float[np.ndarray, "members places"]  # unknowns of the whole runs
-    # [J g r] of the whole runs by (member, run): to first order, r changes by g when pieces join
+    # [J g r] of the whole runs by (member, run): Jacobian, residuals r, and their first-order change g when
+    # pieces join
     rows: np.ndarray
     slopes: Float[np.ndarray, "members pieces states_and_own unknowns"]  # L
     gaps: Float[np.ndarray, "members pieces states_and_own"]  # g
@@ -137,7 +138,9 @@ class Piecewise(Problem):
     def with_ends(
         self, theta: np.ndarray, members: np.ndarray
     ) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
-        """Return [J r] of all pieces with these unknowns, and [J x] of their end states."""
+        """Return Jacobian and residuals [J r] of all pieces with these unknowns, and Jacobian and values [J
+        x] of their end states.
+        """
         _, pieces, M = self.pieces.unknowns.split(theta)[1].shape
         found, ends = [], np.zeros((len(members), pieces, self.states, M + self.shared + 1))
         for b, j, plain in self.pieces.evaluated(theta, members):
@@ -215,8 +218,8 @@ class Piecewise(Problem):
         self.at = self.at.of([member])
 
     def evaluated(self, theta: ByUnknown, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of whole runs. The starts of pieces are moved with the unknowns, to first order, until
-        the pieces join.
+        """Yield Jacobian and residuals [J r] of whole runs. The starts of pieces are moved with the unknowns,
+        to first order, until the pieces join.
         """
         failed = np.zeros(len(members), bool)
         for _ in range(8):
@@ -230,8 +233,8 @@ class Piecewise(Problem):
             yield b, j, closed(rows, self.own + self.shared)
 
     def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
-        """Return [J g r] of whole runs, with a share of the gaps closed. g is the change of r when all gaps
-        are closed.
+        """Return Jacobian and residuals [J g r] of whole runs after a share of the gaps is closed. g is the
+        change of r when all gaps are closed.
         """
         return self._of_runs(members, ~self._move(theta, members, share))
 
@@ -343,7 +346,9 @@ class Piecewise(Problem):
     def _condensed(
         self, run: int, rows_of: np.ndarray, slopes: np.ndarray, gaps: np.ndarray
     ) -> Float[np.ndarray, "samples width"]:
-        """Return [J g r] of a whole run from [J r], derivatives and gaps of all pieces."""
+        """Return [J g r] of a whole run from Jacobians and residuals [J r], derivatives L and gaps of all
+        pieces.
+        """
         M, found = self.own + self.states, np.zeros(self._shape(run))
         for i in np.flatnonzero(self.run_of == run):
             of_piece, of_run = self._places[i]

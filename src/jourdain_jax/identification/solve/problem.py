@@ -46,7 +46,9 @@ class Asked:
 
 @dataclass(frozen=True)
 class Span(ByMember):
-    """The first part of all runs. The first guess is a weak prior with its own size as standard deviation."""
+    """The first part of all runs, for a fit in which the first guess is a weak prior with its own size as
+    standard deviation.
+    """
 
     shares: PerMember  # of the duration of each run, from its start; later samples do not count
     begun: Places  # first guesses
@@ -104,7 +106,7 @@ class Problem:
         return found[members % self.count]
 
     def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of all runs of some members, batch by batch."""
+        """Yield Jacobian and residuals [J r] of all runs of some members, batch by batch."""
         for group in self.groups:
             yield from group.evaluate(*self.unknowns.split(theta), members)
 
@@ -321,8 +323,8 @@ class Problem:
         return parts
 
     def kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
-        """Return [J r] of a batch of one run: first for all channels with known sigma, then for each other
-        channel.
+        """Split Jacobian and residuals [J r] of a batch of one run: first for all channels with known sigma,
+        then for each other channel.
         """
         if not self.estimated:
             return [whole]

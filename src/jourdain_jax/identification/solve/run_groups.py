@@ -83,7 +83,7 @@ def most_knots(runs: Sequence[Run]) -> list[int]:
 
 def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     """Pad a run to `times` samples, and its sampled inputs to `knots` samples, with an axis of members.
-    Padding follows shortly after the end of the run and does not count.
+    Padded samples follow shortly after the end of the run and have zero weight.
     """
     more = times - run.ts.shape[0]
     counts = iter(knots)
@@ -109,7 +109,8 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
     )
 
 
-# indices of the requested members, runs, and [J r] (lanes, samples, unknowns + 1), unknowns of runs first
+# indices of the requested members and of runs; Jacobian and residuals [J r], shape (lanes, samples,
+# unknowns + 1), unknowns of runs first
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]
 _BY_MEMBER = ("values", "weights")  # fields of a run that differ by member
 
@@ -179,7 +180,7 @@ class Group:
         return np.searchsorted(self.runs, runs)
 
     def evaluate(self, shared, local, members) -> Iterator[Some]:
-        """Yield [J r] of all lanes, batch by batch."""
+        """Yield Jacobian and residuals [J r] of all lanes, batch by batch."""
         first, *chunks = self._chunks(len(members))
 
         def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
@@ -280,8 +281,8 @@ def _from_vector(tree) -> Callable:
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
-    """Compile [J r], shape (lanes, samples, local + shared + 1), as a function of the shared numbers and one
-    row of run numbers and unknowns per lane.
+    """Compile Jacobian and residuals [J r], shape (lanes, samples, local + shared + 1), as a function of the
+    shared numbers and, for each lane, one row with the numbers of its run and the unknowns.
 
     `reference`: reference of the scene; `treedef`, `leaves`: structure of scene, options and run, with shapes
     in place of arrays.

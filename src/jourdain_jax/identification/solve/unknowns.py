@@ -106,7 +106,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class _Entry:
-    """One unknown of one or more numbers."""
+    """One unknown quantity, which may consist of several numbers."""
 
     label: str
     unit: str
@@ -267,7 +267,7 @@ def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
             same = estimate.per_run and known.per_run and np.shape(estimate.guess) == np.shape(known.guess)
             if estimate != known and not same:
                 raise ValueError(
-                    f"run {first} and run {index} share `{label}` but state it differently ({known} and "
+                    f"run {first} and run {index} share `{label}` but define it differently ({known} and "
                     f"{estimate}); give both the same, or `per_run=True`"
                 )
     return {label: estimate for label, (_, estimate) in found.items()}
