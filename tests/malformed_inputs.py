@@ -369,7 +369,7 @@ PARTS: dict[str, Case] = {
         "UnknownNameError",
         "no body `bed` in this scene; did you mean `bead`? Valid names: `bead`.",
     ),
-    "pose.q.z": ("AttributeError", "no `z` here; valid names: `x`, `y`."),
+    "pose.q.z": ("AttributeError", "no entry `z`; valid names: `x`, `y`."),
     "jj.gravity(b, 9.81)": (
         "`gravity` was given a Bead, expected a motion: the argument of `loads(self, motion)`"
     ),
@@ -836,7 +836,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.linearize(sleigh, {}, 'headin')": (
         "`ChaplyginSleigh` has no coordinate `headin` to perturb; did you mean `heading`?"
     ),
-    "jj.linearize(b, {}, 3)": "`3` was given, expected names in one text or several",
+    "jj.linearize(b, {}, 3)": "`3` was given, expected names, in one text or in several",
     "jj.linearize(b, {}, ('x', 'x'))": "`coordinates` contains a name twice (x, x); give each once",
     "jj.linearize(sleigh, {}, dependent=('hedding',))": (
         "`ChaplyginSleigh` has no coordinate `hedding` to perturb; did you mean `heading`?"

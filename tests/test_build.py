@@ -116,7 +116,7 @@ def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_u
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
     with pytest.raises(
-        AttributeError, match=r"`Model` has no `bodies`; where a scene is expected, pass its `\.scene`"
+        AttributeError, match="`Model` has no attribute `bodies`; its scene is the attribute `scene`"
     ):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
 

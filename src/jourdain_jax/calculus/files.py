@@ -34,7 +34,7 @@ def read_bytes(path: FilePath, limit: int, what: str = "a file") -> bytes:
     with opened(path, what) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
-        raise ValueError(f"{path}: larger than {limit} bytes, expected {what}")
+        raise ValueError(f"{path}: larger than {limit} bytes, the limit for {what}")
     return content
 
 

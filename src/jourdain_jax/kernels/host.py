@@ -230,8 +230,8 @@ def _against(found: os.stat_result) -> str:
 @functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"every process compiles anew, since machine code is not cached in the folder `{place}`: "
-        f"{against}; set JOURDAIN_JAX_CACHE to a folder of your own, or to 0 for no cache",
+        f"machine code is not cached in the folder `{place}`, so every process compiles it again: {against}; "
+        "set JOURDAIN_JAX_CACHE to a folder of your own, or to 0 for no cache",
         stacklevel=2,
     )
 

@@ -53,7 +53,7 @@ class BuiltFor:
 
     def __getattr__(self, name: str):
         raise AttributeError(
-            f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its `.scene`"
+            f"`{type(self).__name__}` has no attribute `{name}`; its scene is the attribute `scene`"
         )
 
 

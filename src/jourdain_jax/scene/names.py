@@ -42,7 +42,7 @@ def check_names(
 def as_names(names: "str | Iterable[str]") -> Labels:
     """Return names as a tuple. In a text, names are separated by spaces, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
-        raise ValueError(f"`{names}` was given, expected names in one text or several")
+        raise ValueError(f"`{names}` was given, expected names, in one text or in several")
     return tuple(names.split() if isinstance(names, str) else names)
 
 
@@ -67,7 +67,7 @@ class Named(eqx.Module):
                 f"`{name}` was given, but entries are accessed by name; write `q.yaw` or `q['yaw']`, or "
                 "`q.array[0]` for the first entry"
             )
-        raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
+        raise UnknownNameError(f"no entry `{name}`; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):
         if name.startswith("__"):

@@ -305,7 +305,7 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
         if shape != ():
             raise ValueError(
                 f"`{name}` was given an array of shape {shape}, expected one number; use `jax.vmap` or "
-                "`rollout` for many"
+                "`rollout` for many values"
             )
         entries[names.entries.index(name)] = value
         return [name]

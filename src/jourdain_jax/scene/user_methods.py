@@ -129,8 +129,8 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
     for name in names:
         if name not in scene.switching.contacts:
             raise ValueError(
-                f"`{name}` of `{_name(scene)}` got its friction outside the method `{method}`; state `{word}`"
-                " in that method"
+                f"the friction of `{name}` of `{_name(scene)}` is given outside the method `{method}`; use "
+                f"`{word}` in that method"
             )
 
 
@@ -153,8 +153,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
         )
         if (contact.friction is not None) != (name in scene.switching.contacts):
             raise ValueError(
-                f"contact `{name}` of `{_name(scene)}` got its friction outside the method "
-                "`contacts`; state `friction=` in that method"
+                f"the friction of contact `{name}` of `{_name(scene)}` is given outside the method "
+                "`contacts`; use `friction=` in that method"
             )
     return contacts
 
@@ -162,8 +162,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     """Return the events by name; a plain value becomes an event that stops the motion."""
     advice = (
-        "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; name every"
-        " condition"
+        "return a number, positive while the motion may continue, such as `1.4 - motion.q.lean`; name every "
+        "condition"
     )
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():

@@ -168,7 +168,7 @@ class Visual(eqx.Module):
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
         if corners.ndim != 2 or corners.shape[1] != 3 or not all_finite(corners):
             raise ValueError(
-                f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m"
+                f"vertices of a mesh have shape {corners.shape}, expected (points, 3): finite numbers in m"
             )
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
         right = lambda face: len(face) >= 3 and min(face) >= 0 and max(face) < len(corners)

@@ -314,8 +314,8 @@ def _slipping(
 def _checked_height(height: str) -> str:
     if height not in _HEIGHTS:
         raise ValueError(
-            f"contact height `{height}` is unknown; expected `coordinates` (these keep the contact point "
-            "on the ground) or `row` (a geometric constraint does)"
+            f"contact height `{height}` is unknown; expected `coordinates` (they keep the contact point on "
+            "the ground) or `row` (a geometric constraint keeps it there)"
         )
     return height
 

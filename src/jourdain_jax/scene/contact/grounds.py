@@ -167,7 +167,7 @@ class _Round(_Ground):
         """Check and store radius, side and motion."""
         if side not in ("inside", "outside"):
             raise ValueError(
-                f"side `{side}` is unknown; expected `inside` or `outside`, the side of the bodies"
+                f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are"
             )
         self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
         self._moves(what, **motion)
