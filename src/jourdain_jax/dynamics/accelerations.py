@@ -82,7 +82,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
     """Return all reductions by short name: "privileged", "qr", "svd", "kkt", "udwadia-kalaba",
     "gibbs-appell".
 
-    "privileged" and "gibbs-appell" use the scene's privileged velocities.
+    "privileged" and "gibbs-appell" use the scene's independent speeds.
     """
     independent = structure_of(as_scene(scene)).independent
     by_name = Privileged(independent), NullSpaceQR(), NullSpaceSVD(), Multipliers(), UdwadiaKalaba()

@@ -65,7 +65,7 @@ def _rows_work(structure: Structure) -> bool:
 
 
 def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
-    """Return the power that changes T + V, in W, by its causes."""
+    """Return the power that changes T + V, in W, by origin."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
     explicit = structure.driven or "potential" in structure.timed

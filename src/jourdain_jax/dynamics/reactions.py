@@ -81,7 +81,7 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
 def _reactions(scene: Scene, motion: Motion, unit: tuple, found: Accelerations) -> RowReactions:
     (on_bodies, direct), multipliers = unit, found.multipliers
     force, torque = (multipliers[:, None, None] * part for part in (on_bodies.force, on_bodies.torque))
-    # a multiplier is unique if its row is no combination of the others
+    # a multiplier is unique if its row is not a combination of the others
     determined = jnp.diagonal(found.spare) == 0
     return RowReactions(
         multipliers,

@@ -1,10 +1,10 @@
 """Ignorable coordinates, found by probes, and the reduced Appell equations (42) without them (S9).
 
-A coordinate is *cyclic* if its rate is not a privileged velocity and these quantities do not depend on it: B
+A coordinate is *cyclic* if its rate is not an independent speed and these quantities do not depend on it: B
 and b of `qdot = B y + b`, the partial velocities beta and gamma, the inertias R I R' of the bodies, impressed
 forces and torques, forces on speeds, and the potential's gradient. All are taken in the inertial frame and in
-the privileged velocities y. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if
-the privileged accelerations do not depend on it, which is a weaker condition.
+the independent speeds y. The spin of an axisymmetric wheel is an example. A coordinate is *ignorable* if
+the independent accelerations do not depend on it, which is a weaker condition.
 
 Coordinates of both kinds are dropped: they are fixed at the reference, and only the other coordinates k,
 which are *kept*, are integrated:
@@ -41,7 +41,7 @@ DEPENDS = 1e-9  # relative change of a quantity above which it depends on the co
 
 
 class AdmissibleRates(eqx.Module):
-    """Speeds `u = C y + c` and coordinate rates `qdot = B y + b` in the privileged velocities y."""
+    """Speeds `u = C y + c` and coordinate rates `qdot = B y + b` in the independent speeds y."""
 
     C: Float[Array, "speeds freedoms"]
     c: Float[Array, "speeds"]
@@ -56,16 +56,16 @@ class Dependence(eqx.Module):
         np.ndarray, "coordinates"
     ]  # any quantity that a cyclic coordinate must not affect
     rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, by entry
-    accelerations: Bool[np.ndarray, "coordinates"]  # the privileged accelerations
-    privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is a privileged velocity
+    accelerations: Bool[np.ndarray, "coordinates"]  # the independent accelerations
+    privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is an independent speed
 
 
 def cyclic_coordinates(scene: Scene) -> Labels:
-    """Return the cyclic coordinates: their rates are not privileged, and B, b, beta, gamma, R I R' and the
-    impressed forces do not depend on them.
+    """Return the cyclic coordinates: their rates are not independent speeds, and B, b, beta, gamma, R I R'
+    and the impressed forces do not depend on them.
 
-    There are none for constraints nonlinear in the speeds. A quaternion is never cyclic: its own rate depends
-    on it.
+    There are none for constraints nonlinear in the speeds. A quaternion is never cyclic: its own rate
+    depends on it.
     """
     if not structure_of(scene).affine:
         return ()
@@ -74,7 +74,8 @@ def cyclic_coordinates(scene: Scene) -> Labels:
 
 
 def ignorable_coordinates(scene: Scene) -> Labels:
-    """Return coordinates on which the privileged accelerations do not depend; a quaternion counts as a whole.
+    """Return coordinates on which the independent accelerations do not depend; a quaternion
+    counts as a whole.
 
     There are none for constraints nonlinear in the speeds.
     """
@@ -144,7 +145,7 @@ def _probe(scene: Scene, t, q, u, shifts):
 
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
-    """Return the rates `B y + b`, the privileged accelerations, and the terms that a cyclic coordinate must
+    """Return the rates `B y + b`, the independent accelerations, and the terms that a cyclic coordinate must
     not affect (inertial frame).
     """
     structure = structure_of(scene)
@@ -243,8 +244,8 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
 
 
 def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y) -> Float[Array, "freedoms"]:
-    """Return privileged accelerations of the reduced equations (42), a function only of time, kept
-    coordinates and privileged speeds.
+    """Return independent accelerations of the reduced equations (42), a function only of time, kept
+    coordinates and independent speeds.
     """
     structure = structure_of(scene)
     places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]

@@ -58,10 +58,11 @@ def _gradient_and_hessian(f, x):
 
 
 class GibbsAppell(eqx.Module):
-    """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
+    """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the independent
+    accelerations.
 
-    `independent`: indices of the privileged speeds. The reduction applies where the constraints determine all
-    other speeds from these.
+    `independent`: indices of the independent speeds. The reduction applies where the constraints determine
+    all other speeds from these.
     """
 
     independent: tuple[int, ...] = eqx.field(static=True)

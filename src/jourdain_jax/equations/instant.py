@@ -94,7 +94,7 @@ def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLeve
     )
 
 
-@eqx.filter_jit  # one trace serves all its derivatives
+@eqx.filter_jit  # traced once for all derivatives
 def _velocity_level(scene: Scene, t: Scalar, q, u, inputs) -> tuple[VelocityLevel, Motion]:
     motion = motion_at(scene, t, q, u, inputs)
     return VelocityLevel(velocities_of(motion), flatten_rows(velocity_rows(scene, motion), q.dtype)), motion

@@ -112,7 +112,7 @@ def velocities(scene: Scene, t, q, u) -> Velocities:
     return _velocities(scene, as_time(t), as_real(q), as_real(u))
 
 
-@eqx.filter_jit  # one trace serves all its derivatives
+@eqx.filter_jit  # traced once for all derivatives
 def _velocities(scene: Scene, t: Scalar, q, u) -> Velocities:
     return velocities_of(motion_at(scene, t, q, u))
 

@@ -1,4 +1,4 @@
-"""Appell's equations in the minimal state (q, y), y the privileged speeds, for constraints linear or affine
+"""Appell's equations in the minimal state (q, y), y the independent speeds, for constraints linear or affine
 in the speeds.
 
     u    = C y + c                     from the constraints, which hold exactly                      (25)-(31)
@@ -26,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class MinimalKinematics(eqx.Module):
-    """All speeds, from the privileged ones, and the intermediate results."""
+    """All speeds, from the independent ones, and the intermediate results."""
 
     u: Speeds
     partial: VelocityLevel  # beta, gamma, A

@@ -6,7 +6,7 @@
 - `NullSpaceQR`, `NullSpaceSVD`: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`
 - `Multipliers`: the saddle-point (KKT) system, (68)-(70)
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
-- `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
+- `GibbsAppell`: Hessian of the Gibbs function over the independent accelerations (in `gibbs_appell.py`)
 
 All agree to round-off where they apply, which `applicable` tells. If a free direction has no inertia,
 accelerations are NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All allow
@@ -38,7 +38,7 @@ from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 # Least pivot of the scaled A_z. Round-off grows as the inverse square of the pivot: at 1e-2, accelerations
 # agree to 1e-12 with the other reductions.
 APPLICABLE_PIVOT = 1e-2
-SMALLEST_PIVOT = 1e-3  # least pivot for privileged speeds as the state of a simulation
+SMALLEST_PIVOT = 1e-3  # least pivot for independent speeds as the state of a simulation
 
 
 class Reduction(eqx.Module):
@@ -107,8 +107,8 @@ def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[
 
 
 class Privileged(Reduction):
-    """Appell's equations in privileged velocities: the speeds `independent` are free, and the constraints
-    determine the others.
+    """Appell's equations in independent speeds, the paper's privileged velocities. The speeds `independent`
+    are free, and the constraints determine the others.
 
         udot = C yddot + c        y and z in the scene's order, with zdot = B ydot + b, B = -A_z^-1 A_y
         C' (M (C yddot + c) + h - Q) = 0

@@ -141,7 +141,7 @@ def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     return _position_residual(scene, as_time(t), as_coordinates(scene, q))
 
 
-@eqx.filter_jit  # one trace serves all its derivatives
+@eqx.filter_jit  # traced once for all derivatives
 def _position_residual(scene: Scene, t: Scalar, q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 

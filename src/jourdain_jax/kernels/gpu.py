@@ -120,7 +120,7 @@ def handler_text() -> str:
         w.store(words, parameters)
         shape = [w.converted("trunc", blocks, "i32"), one, one, w.literal(nvidia.WARP, "i32"), one, one, zero]
         done("cuLaunchKernel", function, *shape, stream, parameters, nothing)
-        # XLA gives the memory to later work of the same stream alone
+        # XLA reuses this memory only for later work on the same stream
         with w.when(w.load(size, type="i64").differs(0)):
             asked(_FREE, context, w.load(size, type="i64"), w.load(record, type="i64"))
         with w.when(w.load(code, type="i32").differs(0)):

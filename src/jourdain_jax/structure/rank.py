@@ -142,8 +142,8 @@ def _are_bounded(c: np.ndarray) -> bool:
 
 
 def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> Indices:
-    """Return the indices of the named privileged speeds. Raises ValueError for unknown names, and for any
-    other number of names than `freedoms`.
+    """Return the indices of the speeds that a scene names as `privileged`. Raises ValueError for unknown
+    names, and for any other number of names than `freedoms`.
     """
     check_kind(names, str | Iterable, f"`privileged` of `{type(scene).__name__}`", "names of speeds")
     chosen = tuple(

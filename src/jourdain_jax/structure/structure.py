@@ -1,4 +1,4 @@
-"""Facts that hold at every state of a scene, found once by probing: rank, privileged velocities, kinds of
+"""Facts that hold at every state of a scene, found once by probing: rank, independent speeds, kinds of
 constraints.
 
 Random states are drawn from the scene's domain. Symmetric configurations (zero and right angles) are added,
@@ -54,7 +54,7 @@ WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is th
 
 @dataclass(frozen=True)
 class Structure:
-    """Properties of a scene found by probing: rank, privileged speeds, dependence on time, faults."""
+    """Properties of a scene found by probing: rank, independent speeds, dependence on time, faults."""
 
     row_names: Labels
     rank: int  # at generic states
@@ -62,7 +62,7 @@ class Structure:
     redundant_rows: Labels  # may be omitted together: the others keep the rank at every probed state
     may_set_in: Labels  # redundant rows that may be independent away from the probes
     rank_losses: Labels  # probed configurations with fewer independent rows, as text
-    independent: Indices  # privileged speeds, chosen by the user or by conditioning
+    independent: Indices  # independent speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
     typical_pivot: float  # its median
     affine: bool  # constraints are linear or affine in the speeds
@@ -151,18 +151,18 @@ class Structure:
 
     @property
     def has_minimal_state(self) -> bool:
-        """Return whether the integrated state is by default the coordinates and privileged speeds."""
+        """Return whether the integrated state is by default the coordinates and independent speeds."""
         return self.affine and self.well_conditioned
 
     @property
     def well_conditioned(self) -> bool:
-        """Return whether the privileged velocities are usable everywhere in the domain."""
+        """Return whether the independent speeds are usable everywhere in the domain."""
         # for a chain of n rows that each couple two neighbours the value falls as 1/n, although no pivot does
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
 
 def structure_of(scene: Scene) -> Structure:
-    """Return static facts about a scene: rank of its constraints, privileged velocities and their
+    """Return static facts about a scene: rank of its constraints, independent speeds and their
     conditioning, kinds of constraints; eqs. (25)-(31).
 
     They are found once per class and parameter values, at random and symmetric states of the domain. Concrete
