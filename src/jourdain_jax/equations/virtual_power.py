@@ -241,7 +241,7 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
         moved = moved[:, : len(moved[0]) - kept]
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
-    # a constraint with a limit of force has unit normal force, the solution of L_n - 1 = 0
+    # a constraint with a force limit has unit normal force, the solution of L_n - 1 = 0
     held_rows = [[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()]
     one = jnp.array(held_rows, free.dtype).ravel()
     G, b = rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one

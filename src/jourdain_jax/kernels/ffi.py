@@ -178,7 +178,7 @@ def _write_kernel(
 
 def given(w: Writer, buffer: Value) -> Given:
     """Return the array in a buffer that a handler receives."""
-    # words of a buffer: 2 the type, 3 the data, 4 the rank, 5 the sizes
+    # words of a buffer: type (2), data (3), rank (4), sizes (5)
     return Given(w.load(buffer, 3, "ptr"), w.load(buffer, 5, "ptr"), w.load(buffer, 4, "i64"))
 
 

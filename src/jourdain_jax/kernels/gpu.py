@@ -53,8 +53,8 @@ def handler_text() -> str:
     _write_described(w)
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
-        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists come two words
-        # before
+        # words of a frame: interface (2), context (3), attributes (20); the size of a list is two
+        # words before it
         nothing, attributes, context = w.null, w.load(frame, 20, "ptr"), w.load(frame, 3, "i64")
         blocks, number, most, slot = (
             w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in range(4)
@@ -195,7 +195,7 @@ def lowered(
     """
     lanes = math.prod(batch)
     slot, allowed = kernel.record
-    # most slots of a thread if there were one block, in at most an eighth of the device's memory
+    # the most slots of a thread, if there were one block, in at most an eighth of the device's memory
     slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
     blocks = max(1, min(nvidia.blocks(lanes, kernel.loaded), slots))  # a grid needs at least one block
     counter = ctx.avals_out[0].update(shape=(1,), dtype=np.dtype(np.float64), weak_type=False)

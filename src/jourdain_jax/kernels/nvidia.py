@@ -160,7 +160,7 @@ def loaded(text: bytes, name: str) -> Loaded:
             )
         )
         _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
-        # attributes of a kernel: 3 bytes of local memory, 4 registers
+        # numbers of a kernel's attributes: bytes of local memory (3), registers (4)
         device = _devices()[0]
         sizes = [_said("cuKernelGetAttribute", attribute, kernel, device) for attribute in (3, 4)]
         return Loaded(kernel.value or 0, *sizes)
@@ -170,8 +170,8 @@ def blocks(lanes: int, kernel: Loaded) -> int:
     """Return the number of warps for these `lanes`: at most as many as the registers allow and as have their
     local memory in the first-level cache, but at least four per multiprocessor.
     """
-    # attributes of a device: 16 its multiprocessors; of each of them 82 the registers, 81 the cache usable as
-    # shared memory, 106 the maximum number of blocks
+    # numbers of a device's attributes: multiprocessors (16), and for each of these registers (82), cache
+    # usable as shared memory (81), maximum number of blocks (106)
     by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(81) // max(1, WARP * kernel.local)
     # one for each of the four parts of a multiprocessor

@@ -282,7 +282,7 @@ def _round(graph: Graph, params) -> Callable[[int], int]:
     return partial(graph.call, "round")
 
 
-# functions of entries of a graph; `params`: of the primitive
+# function of the graph and of the primitive's `params` -> function of entries
 _ELEMENTWISE: dict[str, Callable[[Graph, dict], Callable]] = {
     **{name: _call(name) for name in TABLE},
     "pow": lambda graph, params: partial(_power, graph),

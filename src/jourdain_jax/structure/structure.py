@@ -157,7 +157,8 @@ class Structure:
     @property
     def well_conditioned(self) -> bool:
         """Return whether the independent speeds are usable everywhere in the domain."""
-        # for a chain of n rows that each couple two neighbours the value falls as 1/n, although no pivot does
+        # in a chain of n rows that each couple two neighbours, `worst_pivot` falls as 1/n, although no pivot
+        # of the chain does
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
 
