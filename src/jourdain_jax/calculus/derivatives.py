@@ -58,7 +58,7 @@ def is_zero(tangent) -> bool:
 
 
 def filled(tangent):
-    """Return the tangent as an array."""
+    """Return the tangent as an array, with zeros for a symbolic zero."""
     return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
 
 

@@ -140,8 +140,8 @@ def accelerations(
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt",
       "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: typical lengths of the constraint rows; a row at the round-off of its typical length counts as
-      zero (default: the scene's typical lengths).
+    - `usual`: typical lengths of the constraint rows; a row that is mere round-off relative to its typical
+      length counts as zero (default: the scene's typical lengths).
 
     It works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
     `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError

@@ -82,7 +82,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 def rate_of_work(
     scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices
 ) -> Scalar:
-    """Return the integrand of the work of the module's last formula, in watts.
+    """Return the integrand of W, the work in the last formula of this module, in watts.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. They contribute by their forces.
     Their stored energy (`stored_by_inputs`) is added to the integral.

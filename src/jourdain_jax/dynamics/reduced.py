@@ -85,7 +85,7 @@ def ignorable_coordinates(scene: Scene) -> Labels:
 
 
 def _named(scene: Scene, chosen) -> Labels:
-    """Return names of the chosen coordinates, among them quaternions with all four entries chosen."""
+    """Return names of the chosen coordinates. A quaternion is named if all four entries are chosen."""
     names: list[str] = []
     groups = {first: group for group, first, _ in scene.coordinate_names.groups}
     skipped: set[int] = set()

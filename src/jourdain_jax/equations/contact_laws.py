@@ -83,7 +83,7 @@ def system(
 
 
 def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
-    """Return `K^-1 right` of a `system`.
+    """Return `K^-1 right` for the matrix K of `system`.
 
     The tangential unknowns are eliminated first. Every pivot is then positive, unless a slipping contact has
     no solution (Painleve's paradox).

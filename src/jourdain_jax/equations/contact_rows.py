@@ -23,7 +23,7 @@ from jourdain_jax.scene.user_methods import contacts_of, held_rows_of
 
 
 class ContactRows(eqx.Module):
-    """Gaps, speeds and their derivatives of all switching contacts at one state, three rows per contact."""
+    """Gaps and speeds of all switching contacts at one state, with derivatives; three rows per contact."""
 
     gap: Float[Array, "contacts"]
     w: Float[Array, "rows"]

@@ -72,7 +72,9 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
-    """Return `beta`, `gamma` and `A`, then velocities and residuals, and the motion at these arguments."""
+    """Return the derivatives with respect to the speeds (`beta`, `gamma` and `A`), the velocities and
+    residuals, and the motion.
+    """
     t, q, u = as_time(t), as_real(q), as_real(u)
 
     def level(u):

@@ -43,8 +43,8 @@ def least_change(
     differentiable in any mode at constant rank.
 
     - `M`: None for the Euclidean metric of the coordinates. The identity replaces a singular `M`.
-    - `typical`: typical lengths of the rows, in scaled speeds with a metric; a row at the round-off of its
-      typical length counts as zero (default: no row does).
+    - `typical`: typical lengths of the rows, in scaled speeds with a metric; a row that is mere round-off
+      relative to its typical length counts as zero (default: no row does).
     - `cutoff`: relative size of singular values below which rows count as dependent (default: `rank_cutoff`).
     - `determined`: whether the constraints can be satisfied and determine all free entries. Only the first
       term of the derivative then remains.

@@ -26,7 +26,7 @@ MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8
 
 
 class RowFunctions(NamedTuple):
-    """Evaluation of a scene's constraints, their derivatives and the mass matrix."""
+    """Functions that evaluate a scene's constraints, their derivatives and the mass matrix."""
 
     closures: Callable  # (scene, t, q) -> g, G
     rows: Callable  # (scene, t, q, u, inputs) -> phi, A
@@ -34,7 +34,7 @@ class RowFunctions(NamedTuple):
     parameters: Callable | None = None  # scene -> first argument of `closures` and `rows`; None: the scene
 
     def given(self, scene: Scene):
-        """Return the first argument of `closures` and `rows`, from a scene."""
+        """Return the first argument of `closures` and `rows` for a scene."""
         return scene if self.parameters is None else self.parameters(scene)
 
 
@@ -72,8 +72,8 @@ def project_positions(
     """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
-    `typical`: typical lengths of the rows of G, from `closure_lengths`; a row at the round-off of its typical
-    length counts as zero (default: no row does). `by`: the evaluation of the constraints.
+    `typical`: typical lengths of the rows of G, from `closure_lengths`; a row that is mere round-off relative
+    to its typical length counts as zero (default: no row does). `by`: the evaluation of the constraints.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
@@ -121,8 +121,8 @@ def project_speeds(
     only `free` speeds change.
 
     - `cutoff`: relative size of singular values below which rows count as dependent (default: `rank_cutoff`).
-    - `typical`: typical lengths of the rows in scaled speeds, from `usual_rows`; a row at the round-off of
-      its typical length counts as zero (default: no row does).
+    - `typical`: typical lengths of the rows in scaled speeds, from `usual_rows`; a row that is mere round-off
+      relative to its typical length counts as zero (default: no row does).
     - `affine`: whether the constraints are affine in the speeds. One step is then exact, and `iterations`
       has no effect.
     - `determined`: whether affine constraints determine all `free` speeds. No metric is then used, and

@@ -70,7 +70,7 @@ def reduce(reduction: Reduction, equations: UnconstrainedEquations, rows: Constr
 
 
 def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduced:
-    """Return known accelerations with their constraint force."""
+    """Return accelerations that are already known, with their constraint force."""
     # A' lambda = M udot + h - Q
     return Reduced(udot, equations.M @ udot + equations.h - equations.Q, pivot, applicable)
 
@@ -151,7 +151,7 @@ class Partition(eqx.Module):
     def all_from(
         self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]
     ) -> Float[Array, "speeds *k"]:
-        """Return all speeds, in order, from the independent and the dependent ones."""
+        """Return all speeds in the scene's order, from the independent and the dependent ones."""
         order = np.argsort([*self.independent, *self.dependent])
         return jnp.concatenate([y, z])[order]
 

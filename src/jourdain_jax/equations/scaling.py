@@ -44,7 +44,7 @@ def row_scale(
     row without a typical length.
 
     So a row that becomes shorter than its typical length has a length below 1 after scaling. It counts as
-    zero at the round-off of its typical length.
+    zero once it is mere round-off relative to its typical length.
     """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
     if typical is not None:

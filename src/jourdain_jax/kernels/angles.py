@@ -184,7 +184,7 @@ def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[DoubleDou
 
 
 def _reduced_far(w: Writer, x: Value) -> Triple:
-    """Return `_reduced` for large angles, and NaN for small ones.
+    """Return the results of `_reduced` for large angles, and NaN for small ones.
 
     x = m 2^e with an integer m of 53 bits. Only 192 bits of 2/pi matter: the others contribute whole turns,
     or less than about 2^-126, when multiplied by m.
@@ -350,8 +350,8 @@ def arccosine(w: Writer, x: Value) -> Value:
 
 
 def _of_half(w: Writer, x: Value) -> Triple:
-    """Return whether |x| is above 1/2, and an arc in two parts: asin |x|, or above 1/2 asin sqrt((1 -
-    |x|)/2).
+    """Return whether |x| > 1/2, and an arc in two parts: asin sqrt((1 - |x|)/2) if it is,
+    otherwise asin |x|.
     """
     a = w.magnitude(x)
     large = a > 0.5

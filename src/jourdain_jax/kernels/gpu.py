@@ -95,7 +95,7 @@ def handler_text() -> str:
         w.store(w.literal(0, "i32"), code)
 
         def done(function: str, *arguments: Value) -> None:
-            """Call a function of the driver, unless an earlier one failed."""
+            """Call a function of the driver, unless an earlier call failed."""
             with w.when(w.load(code, type="i32").equals(0)):
                 w.store(w.external(function, "i32", *arguments), code)
 
@@ -181,8 +181,8 @@ def registered(text: str, record: tuple[int, int]) -> Kernel:
 
 
 def _lanes_last(rank: int, lanes: int) -> tuple[int, ...]:
-    """Return the order of an array's axes in memory, the fastest first. The first `lanes` axes are faster
-    than all others.
+    """Return the axes of an array in their order in memory, the fastest first. The first `lanes` axes are
+    faster than all others.
     """
     return (*reversed(range(lanes)), *reversed(range(lanes, rank)))
 

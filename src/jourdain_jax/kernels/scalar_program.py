@@ -24,7 +24,7 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 
 @dataclass
 class Turn:
-    """Values to load before a value is computed, and values to store after it with their memory slots."""
+    """Values to load before a value is computed, and values to store afterwards, with their memory slots."""
 
     loaded: list[int]
     stored: list[tuple[int, int]] = field(default_factory=list)
@@ -135,7 +135,7 @@ def written_in_turn(
 
 
 class _AtHand:
-    """Moves values of a long function to memory, and back before their next use, as `turns` decides."""
+    """Moves values of a long function to memory, and back before their next use, as planned by `turns`."""
 
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
         self.w, self.values, self.places = w, values, dict(values)

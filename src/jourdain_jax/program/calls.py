@@ -79,7 +79,7 @@ class Call:
         return Call(closed, self.reasons)
 
     def results(self, *operands) -> tuple:
-        """Return the results; operands and results may have trailing batch axes."""
+        """Return the results of the call; operands and results may have trailing batch axes."""
         function = jaxpr_as_fun(self.closed)
         avals = [v.aval for v in self.closed.jaxpr.invars]
         real = [x.dtype for x in operands if jnp.issubdtype(x.dtype, jnp.floating)]

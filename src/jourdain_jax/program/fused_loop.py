@@ -1,9 +1,9 @@
-"""Several values of one shape, computed in one loop over their elements. Their shared parts are computed
-once.
+"""Several values of one shape, computed in one loop over their elements. Their shared parts are
+computed once.
 
-XLA on CPUs makes a separate loop for each result of a program and repeats shared parts in each. A reduction
-over several operands is one loop, so each value is padded with a zero and reduced. To JAX this is the
-identity: linear and elementwise.
+XLA on CPUs makes a separate loop for each result of a program and repeats shared parts in each, but it makes
+one loop for a reduction over several operands. Therefore each value is padded with a zero, and all are summed
+over value and zero in one reduction. JAX treats this as the identity, which is linear and elementwise.
 """
 
 import jax.numpy as jnp

@@ -126,7 +126,7 @@ class Graph:
         return self._node("add", (a, b) if a < b else (b, a))
 
     def _without_wave(self, a: int, b: int) -> int | None:
-        """Return x for a = sin(w)^2 x, b = cos(w)^2 x in either order; None for other products."""
+        """Return x if a = sin(w)^2 x and b = cos(w)^2 x, or the reverse; None for other products."""
         factors = self._factors(a), self._factors(b)
         if len(factors[0]) != len(factors[1]):
             return None
@@ -295,7 +295,9 @@ class Graph:
         return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
 
     def copied(self, nodes: Iterable[int], of: "Graph", known: Mapping[int, int]) -> dict[int, int]:
-        """Return a dictionary, node of another graph -> its copy; `known` has copies that exist already."""
+        """Copy nodes of another graph. Return a dictionary, node -> its copy; `known` has copies that
+        exist already.
+        """
         nodes, new = list(nodes), dict(known)
         for node in of.needed(nodes, new):
             new[node] = (

@@ -82,7 +82,9 @@ class IdentityProbes:
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
-        """Return these probes for another graph. `names`: name of each input there -> its name here."""
+        """Return these probes for another graph. `names`: name of each input in that graph -> its name
+        in this one.
+        """
         errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 

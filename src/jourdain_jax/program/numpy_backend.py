@@ -305,7 +305,7 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
 
 
 def _in_order(x: np.ndarray) -> np.ndarray:
-    """Return integers in the total order of floats: -NaN, -inf, ..., -0, 0, ..., inf, NaN."""
+    """Return integers that are ordered like the floats: -NaN, -inf, ..., -0, 0, ..., inf, NaN."""
     if x.dtype.kind != "f":
         return x
     bits = x.view(f"i{x.itemsize}")

@@ -21,11 +21,11 @@ class Language:
 
     @property
     def names(self) -> set[str]:
-        """Return the names of functions."""
+        """Return the names of all functions in this language."""
         return {getattr(operation, self.name) or name for name, operation in TABLE.items()}
 
     def written(self, op: str, operands: list[str]) -> str:
-        """Return the source of a function of operands."""
+        """Return the source of an operation on `operands`."""
         form = getattr(TABLE[op], self.name) or self.library + op
         return f"({form.format(*operands)})" if "{" in form else f"{form}({', '.join(operands)})"
 

@@ -1,8 +1,8 @@
-"""Names of generalized coordinates `q` and generalized speeds `u`, and their default correspondence.
+"""Names of generalized coordinates `q` and generalized speeds `u`, and the default speeds of coordinates.
 
-A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has the three body components of
-the angular velocity as speeds, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0,
-omega)`.
+A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has the three body components
+of the angular velocity as speeds, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude
+(0, omega)`.
 """
 
 import keyword

@@ -1,5 +1,5 @@
 """Digests of numbers, texts, containers, scenes and functions. A digest is the same in every process. Digests
-identify studies: with a changed function, a study is a different one.
+identify studies: a study with a changed function is a different study.
 
 The digest of a user's function covers its code (byte code, constants, names), default arguments, closed-over
 values, and the globals that its code names, including those in the user's other modules. A function or class
@@ -91,8 +91,8 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
 
 
 def _is_formula(x: object) -> bool:
-    """Return whether x is a SymPy expression. These are digested by their text, since SymPy numbers symbols
-    differently in every process.
+    """Return whether x is a SymPy expression. Such expressions are digested by their text, since SymPy
+    numbers symbols differently in every process.
     """
     sympy = sys.modules.get("sympy")
     return sympy is not None and isinstance(
@@ -121,8 +121,8 @@ def _function(f: FunctionType, of) -> object:
     attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
-        """Return the content of a name's value; for a user's module, that of the
-        attributes that the code names.
+        """Return the content of a name's value. For a user's module, return the content of the attributes
+        that the code names.
         """
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)

@@ -42,8 +42,8 @@ def clear_caches() -> None:
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """Decorate a function of a scene and further keys so that it runs once per class and parameter values. It
-    gets concrete parameters, even during tracing.
+    """Decorate a function so that it runs once per class, parameter values and further keys. It gets concrete
+    parameters, even during tracing.
 
     `of_traced`: a function that is called instead, without caching, for scenes with traced parameters.
     """
@@ -78,7 +78,7 @@ class Values:
 
     @property
     def scene(self):
-        """The scene."""
+        """The scene of this key."""
         return jax.tree.unflatten(self.structure[0], self.leaves)
 
     def __hash__(self):
@@ -108,8 +108,8 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Replace traced parameters by the numbers of `scene` within this context, for
-    scenes of the same structure.
+    """Return a context in which the numbers of `scene` replace traced parameters of scenes of the
+    same structure.
 
     `varied`: names of the parameters (None: all) that get generic numbers near those of `scene`.
     """
@@ -205,8 +205,8 @@ def _is_inertia(x: np.ndarray) -> bool:
 
 
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
-    """Decorate a function of a scene and further keys that depends only on the class and the shapes of the
-    parameters, so that it runs once for these.
+    """Decorate a function so that it runs once per class, shapes of the parameters and further keys. Its
+    result must depend on these alone.
 
     `most`: maximum number of stored results.
     """
@@ -234,8 +234,8 @@ _BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=Mappi
 
 @contextmanager
 def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
-    """Use stored results of decorated functions within this context. `found`: results by
-    function name and first further key.
+    """Return a context in which decorated functions take their results from `found`: function name and first
+    further key -> result.
     """
     token = _BEFORE.set(found)
     try:

@@ -124,8 +124,8 @@ def damper(a: Point, b: Point, damping: Any) -> Load:
 
 
 def generalized_force(motion: Motion, **forces: Any) -> Load:
-    """Return forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`;
-    no potential.
+    """Return the load of generalized forces Q_k on speeds, by name: `generalized_force(motion,
+    steer_rate=torque)`. Its power is `sum Q_k u_k`; it has no potential.
 
     `forces`: speed -> force, in N or N m. Raises ValueError for an unknown speed.
     """

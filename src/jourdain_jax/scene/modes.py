@@ -33,8 +33,8 @@ class Modes:
         return tuple(name for name, _ in self.pairs)
 
     def number(self, name: str, value, where: str):
-        """Return the number of a mode's value, given by name or number. Raises ValueError for an unknown
-        value. `where`: the origin of the value, for the message.
+        """Return the number of a mode's `value`, which is a name or a number. Raises ValueError for an
+        unknown value. `where`: the origin of the value, for the message.
         """
         names = self.values[name]
         if isinstance(value, str):

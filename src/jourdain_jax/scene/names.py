@@ -34,7 +34,7 @@ def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception
 def check_names(
     names: Iterable[str], valid: Iterable[str], what: str, error: type[Exception] = ValueError
 ) -> None:
-    """Check each of several names. `{}` in `what` is replaced by the name."""
+    """Check several names. `{}` in the text `what` is replaced by the invalid name."""
     for name in names:
         check_name(name, valid, what.replace("{}", str(name)), error)
 

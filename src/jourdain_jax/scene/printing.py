@@ -14,7 +14,7 @@ from jourdain_jax.scene.parameter_fields import parameters_of
 
 
 class Printed:
-    """Base of results with a `_text()`, shown by `print`, a console and a notebook."""
+    """Base of results: `print`, a console and a notebook show their `_text()`."""
 
     def __str__(self) -> str:
         return shapes_of(self) if is_traced(self) else self._text()
@@ -97,14 +97,14 @@ def _value(value) -> str:
 
 
 def in_digits(values) -> list[str]:
-    """Return texts of numbers with six digits. Numbers below the round-off of the largest become 0."""
+    """Return numbers as texts with six digits. Numbers below the round-off of the largest become 0."""
     values = np.asarray(values)
     least = eps_of(values) * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]
 
 
 def shapes_of(result) -> str:
-    """Return the description of a result with traced numbers."""
+    """Return a text about a result whose numbers are traced."""
     shapes = [tuple(leaf.shape) for leaf in jax.tree.leaves(result) if hasattr(leaf, "shape")]
     largest = max(shapes, key=lambda shape: (len(shape), shape), default=())
     name = type(result).__name__
@@ -135,7 +135,7 @@ def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[s
 
 
 def complex_numbers(values) -> list[str]:
-    """Return texts such as `-0.5+2.1i`."""
+    """Return complex numbers as texts, such as `-0.5+2.1i`."""
     values = np.asarray(values)
     parts = in_digits(np.concatenate([values.real, values.imag]))
     pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)

@@ -221,7 +221,7 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
 def shape(
     kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None
 ) -> Visual:
-    """Return a shape of this kind; the other arguments as for all shapes."""
+    """Return a shape of this `kind` and `size`; the other arguments are as for all shapes."""
     advice = "give three components in the body frame, m"
     at = checked_real(at, f"place of a {kind}", (3,), advice=advice).astype(real_type())
     turn = jnp.eye(3) if turn is None else turn

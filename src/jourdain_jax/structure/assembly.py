@@ -1,5 +1,5 @@
-"""Random states of the domain, and projection of many configurations at once onto the geometric constraints,
-within the domain, on NumPy.
+"""Random states of a scene's domain, and projection of configurations onto the geometric constraints. NumPy
+projects all configurations at once, and keeps them within the domain if possible.
 
     q <- q - G+ g(q),   G = dg/dq          Gauss-Newton, which stays near its start
 
@@ -111,8 +111,8 @@ def typical_row_lengths(
 ) -> Float[np.ndarray, "rows"]:
     """Return the typical length of each row, as `usual_lengths_of`.
 
-    `elsewhere`: the rows at states off the geometric constraints. A row at the round-off of its length there
-    gets that length, and so counts as zero.
+    `elsewhere`: the rows at states off the geometric constraints. A row that is mere round-off relative to
+    its length there gets that length, and so counts as zero.
     """
     length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
     return np.where(length > np.sqrt(eps_of(A)) * beyond, length, beyond)

@@ -64,8 +64,8 @@ def _lopsided(x):
 
 
 def _negative(x):
-    """Return whether an inertia matrix has a negative eigenvalue, by its principal minors, relative to its
-    largest entry or to the inertia of a point.
+    """Return whether an inertia matrix has a negative eigenvalue. The test uses its principal minors, with a
+    tolerance relative to its largest entry or to the inertia of a point.
     """
     I, size = x[..., :3, :], _size(x)
     I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]

@@ -92,13 +92,13 @@ def redundant_rows(
     names: Labels,
     far: Callable[[], Scaled],
 ) -> Labels:
-    """Return rows that may be omitted, later rows first: the others keep the rank at every probed state and
-    stay well conditioned.
+    """Return rows that may be omitted, later rows rather than earlier ones: the others keep the rank at every
+    probed state and stay well conditioned.
 
     A row is omitted only if it is a combination of the others with bounded coefficients. An example of
-    unbounded coefficients is the lateral row of one wheel of an axle: it is a combination of its longitudinal
-    row and the rows of the other wheel, with tangents of the heading. `generic`: which of the states `found`
-    are random; `far`: function that returns rows at distant angles.
+    unbounded coefficients is the lateral row of one wheel of an axle: as a combination of its longitudinal
+    row and the rows of the other wheel, it has tangents of the heading as coefficients. `generic`: which of
+    the states `found` are random; `far`: function that returns rows at distant angles.
     """
     if not ranks:  # a scene without usable states has another fault
         return ()

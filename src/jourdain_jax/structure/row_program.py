@@ -64,7 +64,7 @@ class RowProgram:
 
 @once_per_class
 def row_program(scene: Scene) -> RowProgram | None:
-    """Return the program of a class of scenes; None if a part of it has no scalar program."""
+    """Return the program of a class of scenes; None if a part of it has no scalar form."""
     scene = with_reference_parameters(scene)
     try:
         nodes = looked_at(scene)

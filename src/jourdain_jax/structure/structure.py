@@ -211,8 +211,8 @@ def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
 
 
 def usual_rows(scene: Scene, varied: bool = False) -> UsualRows:
-    """Return typical lengths of the rows in scaled speeds, and their rank at generic states; for a batch
-    whose parameters are `varied`, from one sample `scene`.
+    """Return typical lengths of the rows in scaled speeds, and their rank at generic states. `varied`:
+    whether `scene` is one sample of a batch, whose parameters differ.
     """
     known = structure_whatever_its_faults(scene)
     return UsualRows(known.row_lengths * trust(scene, varied), np.asarray(known.rank, np.int32))
@@ -370,7 +370,7 @@ class Reference:
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
-        """Replace traced parameters by the numbers of this scene within this context."""
+        """Return a context in which the numbers of this scene replace traced parameters."""
         with reference_parameters(self.scene, self._varied):
             yield
 

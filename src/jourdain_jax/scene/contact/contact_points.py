@@ -28,7 +28,7 @@ class Ball(eqx.Module):
     radius: Scalar  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point, with n upwards: `c - a n` with the centre c and the radius a."""
+        """Return the lowest point if n points upwards: `c - a n` with the centre c and the radius a."""
         return self.centre - self.radius * n
 
 
@@ -46,8 +46,8 @@ class Wheel(eqx.Module):
         return self.radius if self.tyre is None else self.radius - self.tyre
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point, with n upwards: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the
-        centre c, the axle k, the radius R and the tyre r.
+        """Return the lowest point if n points upwards: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with
+        the centre c, the axle k, the radius R and the tyre r.
         """
         up = n - (n @ self.axle) * self.axle
         point = self.centre - self.circle * up / jnp.sqrt(up @ up)
@@ -62,7 +62,7 @@ class Ellipsoid(eqx.Module):
     semi_axes: Vector3  # m
 
     def lowest(self, n: Vector3) -> Vector3:
-        """Return the lowest point, with n upwards: `c - R S n'/sqrt(n'.S n')`, with the centre c, the
+        """Return the lowest point if n points upwards: `c - R S n'/sqrt(n'.S n')`, with the centre c, the
         orientation R, `n' = R' n` and the squared semi-axes S.
         """
         local = n @ self.orientation
@@ -74,7 +74,7 @@ Shape = Ball | Wheel | Ellipsoid
 
 
 class Touch(eqx.Module):
-    """The nearest point of a body to a ground."""
+    """The point of a body that is nearest to a ground."""
 
     point: Vector3  # m, inertial frame, of the body
     plane: Plane  # tangent to the ground
@@ -104,8 +104,8 @@ def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
 
 
 def _of_core(core: Vector3, distance: Scalar, ground: Cylinder | Sphere) -> Touch:
-    """Return the contact of a body made of the points within `distance` (m) of a core point; NaN if the body
-    does not fit into a hollow ground.
+    """Return the contact of a body that consists of all points within `distance` (m) of a core point; NaN if
+    the body does not fit into a hollow ground.
     """
     if ground.side == "inside":
         distance = jnp.where(distance < ground.radius, distance, jnp.nan)

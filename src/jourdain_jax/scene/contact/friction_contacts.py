@@ -56,7 +56,9 @@ NONE_SWITCHES = Switching()
 
 
 class Declared:
-    """A class attribute with the class's own declarations, extended for a scene with friction."""
+    """A class attribute that returns the class's own declarations; for a scene with friction it returns the
+    extended ones.
+    """
 
     def __init__(self, name: str, stated: Any):
         self.name, self.stated = name, stated

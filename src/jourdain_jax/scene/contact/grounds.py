@@ -219,10 +219,10 @@ class Cylinder(_Round):
 
 
 class Sphere(_Round):
-    """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl) or
-    "outside".
+    """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl)
+    or "outside".
 
-    `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s). All vectors in the
+    `velocity` (m/s): of its material point at the origin; `angular_velocity` in rad/s. All vectors are in the
     inertial frame. Raises ValueError for a radius that is not positive or an unknown side.
     """
 
