@@ -124,7 +124,7 @@ def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
-    """Return lines of a matrix with names of its rows and columns."""
+    """Return a matrix as lines of text, with names of its rows and columns."""
     shape, digits = np.shape(values), in_digits(np.ravel(values))
     return table(
         [

@@ -89,7 +89,9 @@ class Scene(eqx.Module):
     switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts with friction
 
     def __init_subclass__(cls, **options):
-        """Check the names that the methods read. Raises ValueError for a name of an object with state."""
+        """Check the names that the methods read. Raises ValueError if a name refers to an
+        object with state.
+        """
         super().__init_subclass__(**options)
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
             modes = dict(cls.modes.pairs)

@@ -133,8 +133,8 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
 
 
 def _are_bounded(c: np.ndarray) -> bool:
-    """Return whether coefficients are bounded over many states: none is large, and none exceeds its usual
-    size with both signs, as a tangent does.
+    """Return whether coefficients are bounded over many states: none is large, and none far exceeds its
+    median size with both signs, as a tangent does.
     """
     usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(eps_of(c))
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)

@@ -78,8 +78,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
 
 
 def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return intervals of time, each with one of the states `q`: 192 in the usual span, and up to 128 between
-    the numbers of each of the scene's arrays, which may be sample times.
+    """Return intervals of time, each with one of the states `q`: 192 in the scene's `example_span`, and up to
+    128 between the numbers of each of the scene's arrays, which may be sample times.
     """
     span = float(scene.example_span)
     t = np.linspace(1e-6 * span, span, 193)
