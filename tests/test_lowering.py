@@ -140,7 +140,7 @@ def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
     assert "SI units and radians): mass (kg), radius (m), gravity (m/s^2)" in str(disc)
     assert "monitored guards, which must stay positive: cos(lean)" in str(disc)
     assert (
-        '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""'
+        '"""Values that depend only on parameters of TiltingDisc: mass (kg), radius (m), gravity (m/s^2)."""'
         in disc.python_source()
     )
     assert "positive spin rolls forward" in disc.python_source()

@@ -367,7 +367,7 @@ class Mutant:
         )
 
 
-DENSE = "differs from the dense path"
+DENSE = "differs from dense matrices"
 BUILD, KINEMATICS = appell.AppellOnGraph, partial_velocities.Kinematics
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts

@@ -1,4 +1,4 @@
-"""`python -m jourdain_jax` is the command line."""
+"""Run the command line, as `python -m jourdain_jax`."""
 
 import sys
 

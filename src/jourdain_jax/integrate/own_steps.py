@@ -51,9 +51,7 @@ class OwnSteps(Integrator):
     max_steps: int
     event_names: tuple[str, ...]
     native: bool  # whether machine code may integrate
-    order: (
-        int | None
-    )  # order of Taylor series, which machine code uses in place of the tableau; None: tableau
+    order: int | None  # order of the Taylor series used in place of the tableau; None: no series
     memory: int  # limit in bytes for the record of reverse mode
     most: int  # maximum number of events after which a motion continues
     stopping: bool  # whether stop events end a motion

@@ -1,9 +1,9 @@
 """Functions of time as programs: operations, plain numbers and captured values.
 
-A function of time is traced in every call that receives it. Captured values (arrays, traced numbers) and
-plain numbers in sums, products, quotients and comparisons become arguments of a program and have derivatives.
-The remaining operations are compared by value. A new function with the same operations but other numbers
-compiles nothing; a function whose globals changed is a new program.
+A function of time is traced in each call that receives it. Captured values (arrays, traced numbers) and plain
+numbers in sums, products, quotients and comparisons become arguments of a program and have derivatives. The
+remaining operations identify the program. A new function with the same operations but other numbers therefore
+needs no compilation; a function whose globals have changed is a new program.
 """
 
 from collections.abc import Callable, Hashable
@@ -21,11 +21,11 @@ from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.outside_names import now_read_by
 
-_TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # differentiable in a nonzero number
+_TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # differentiable in nonzero numbers
 
 
 class TimeProgram:
-    """Operations of a function of time without its numbers; equal if the operations are equal."""
+    """Operations of a function of time, without its numbers. Programs are equal if their operations are."""
 
     def __init__(self, closed: ClosedJaxpr, real):
         taken: list[tuple[Var, Literal]] = []
@@ -55,11 +55,11 @@ class TimeProgram:
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Return the shapes of the arguments before the time: plain numbers and captured values."""
+        """Return the shapes of the arguments other than time: plain numbers, then captured values."""
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
-        """Return the value at time t; `numbers`: the plain numbers; `held`: the captured values."""
+        """Return the value at time t. `numbers`: the plain numbers; `held`: the captured values."""
         given = zip((*numbers, *held, t), self.closed.in_avals, strict=True)
         return jaxpr_as_fun(self.closed)(*(jnp.asarray(x, like.dtype) for x, like in given))[0]
 
@@ -70,12 +70,12 @@ class TimeProgram:
         return self is other or (isinstance(other, TimeProgram) and self._key == other._key)
 
     def does_the_same_as(self, other: "TimeProgram") -> bool:
-        """Return whether both are traces of one known function, ignoring derivative rules."""
+        """Return whether both programs have the same operations, ignoring custom derivative rules."""
         return self._key == other._key or _without_rules(self._key) == _without_rules(other._key)
 
 
 def _without_rules(described):
-    """Return a description without custom derivative rules."""
+    """Return a description of operations without custom derivative rules."""
     if not isinstance(described, tuple):
         return described
     if (
@@ -94,7 +94,7 @@ def _without_rules(described):
 
 
 class FunctionOfTime(eqx.Module):
-    """Input as a function of time: its operations, their plain numbers, and captured arrays."""
+    """Input as a function of time: its operations, plain numbers, and captured arrays."""
 
     program: TimeProgram = eqx.field(static=True)
     numbers: Float[Array, "*lanes numbers"]
@@ -106,10 +106,9 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """Return a function of time with its captured values, and the shape of its value. The function is None
-    unless its value is one number.
+    """Return a `FunctionOfTime` (None unless its value is one number), and the shape of its value.
 
-    A function is traced again if it is new, or if a value that it reads has changed (`scene/identity.py`).
+    A function is traced if it is new, or if a value that it reads has changed (`scene/identity.py`).
     """
     try:
         kept = _trace(function)
@@ -134,7 +133,7 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
 
 
 class _Trace:
-    """Last trace of a function, and the values it then read."""
+    """Last trace of a function, and the values that it read then."""
 
     def __init__(self) -> None:
         self.again = False
@@ -149,5 +148,5 @@ def _trace(function: Callable) -> _Trace:
 
 
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
-    """Compile `f` for a set of input programs; the least recently used is dropped."""
+    """Return a function that compiles `f` for given input programs. The 16 most recently used are kept."""
     return lru_cache(maxsize=16)(lambda programs: compiled(f, options))

@@ -32,13 +32,13 @@ from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
 
 @dataclass(frozen=True)
 class Strategy:
-    """Strategy for building the equations; all strategies give equal values."""
+    """Way to build the equations. All strategies give equal values, but programs of different length."""
 
     explicit: bool = True  # as in `Kinematics`
-    most_terms: int = 0  # limit of a normal form; 0: no normal forms
-    most_terms_of_equations: int = 0  # the same for the entries of M and f
+    most_terms: int = 0  # maximum number of terms of a normal form; 0: no normal forms
+    most_terms_of_equations: int = 0  # the same limit for entries of M and f
     by_determinants: bool = False  # accelerations by Cramer's rule, with dependent speeds as symbols
-    held: tuple[int, ...] = ()  # ignorable coordinates, fixed at the reference in the accelerations
+    held: tuple[int, ...] = ()  # ignorable coordinates, which have reference values in the accelerations
 
     @property
     def description(self) -> str:
@@ -51,18 +51,18 @@ class Strategy:
 
 @dataclass
 class Equations:
-    """Nodes of the rates of the minimal state."""
+    """Nodes of the rates of the integrated state, and of quantities computed with them."""
 
     qdot: NodeList
     ydot: NodeList
     z: NodeList  # dependent speeds
     pivots: NodeList  # must not vanish
     guards: NodeList = field(default_factory=list)  # must stay positive
-    power: int = 0  # `rate_of_work`
-    events: NodeList = field(default_factory=list)  # values of the stop events
+    power: int = 0  # rate of the integrated work (`rate_of_work`)
+    events: NodeList = field(default_factory=list)  # values of the events
     resets: NodeList = field(default_factory=list)  # after each event: state, modes, energy in loads
     energies: NodeList = field(default_factory=list)  # kinetic and potential
-    directions: NodeList = field(default_factory=list)  # of nonlinear constraints, by speed: must not reverse
+    directions: NodeList = field(default_factory=list)  # of nonlinear constraints; must not reverse
     squares: NodeList = field(default_factory=list)  # of constraints with multipliers (`Accelerations`)
 
 
@@ -84,7 +84,7 @@ class AppellOnGraph:
             simplify_contacts(traced, self._forms)
 
     def build(self, strategy: Strategy) -> Equations:
-        """Return the equations built by one strategy."""
+        """Return the equations, built by the given strategy."""
         forms = self._forms(strategy.most_terms)
         held = self._at_reference(strategy.held)
         kinematics = Kinematics(self, forms, held, strategy.explicit, strategy.by_determinants)
@@ -125,7 +125,7 @@ class AppellOnGraph:
         )
 
     def _of_state(self, resets: np.ndarray) -> NodeList:
-        """Return the state changes at events, without dependent speeds."""
+        """Return the values after events, except those of dependent speeds, as a flat list."""
         if not resets.size:
             return []
         first = len(self.traced.q)
@@ -135,13 +135,14 @@ class AppellOnGraph:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
     def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[NodeList, NodeList]:
-        """Return coordinates projected onto quaternion norms and geometric constraints, and speeds projected
-        onto velocity constraints (none if these are eliminated). Closed contacts count as constraints.
+        """Return the coordinates projected onto quaternion norms and geometric constraints, and the speeds
+        projected onto velocity constraints (none if these are eliminated). Closed contacts count as
+        constraints.
         """
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        # fix only ignorable coordinates that vary; constraints have derivatives with respect to the others
+        # fix only ignorable coordinates that vary, because derivatives with respect to the others are needed
         varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))
         closure = g.substituted(
             closure, unaffected(self.identity_probes, closure, self._at_reference(varying))
@@ -159,15 +160,15 @@ class AppellOnGraph:
             M, _ = self._equations(Kinematics(self, forms, {}, explicit=True), forms)
             phi = [int(at.phi[s]) for s in self.multiplied]
             speeds = self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
-        if len(at.held):  # closed contacts first
+        if len(at.held):  # project onto closed contacts first
             u, (held_q, held_u) = self.traced.u.tolist(), np.split(at.held, [len(q)])
             moved = g.substituted(moved, dict(zip(q, held_q.tolist(), strict=True)))
             speeds = g.substituted(held_u.tolist(), dict(zip(u, speeds or u, strict=True)))
         return moved, speeds
 
     def _power(self, k: "Kinematics", ydot: NodeList) -> int:
-        """Return the power of loads without a potential, of explicit time in potentials, of constraints that
-        do work, of prescribed poses, and of changing masses.
+        """Return the power of everything that changes T + V: loads without a potential, explicit time in
+        potentials, constraints that do work, prescribed poses, and changing masses.
 
             traced power + sum (m a - F).v + (I alpha + omega x I omega - L).omega
                          + sum (mdot v.v + omega.(dI/dt omega))/2 - Q_direct.u
@@ -222,7 +223,7 @@ class AppellOnGraph:
     def _true_rates(
         self, kinematics: "Kinematics", forms: NormalForms
     ) -> tuple[NodeList, NodeList, NodeList]:
-        """Return dependent speeds and coordinate rates with no coordinate fixed, and new pivots."""
+        """Return the dependent speeds and coordinate rates without fixed coordinates, and new pivots."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))

@@ -1,5 +1,5 @@
-"""Comparison of the rates of two programs, or of a program and dense matrices, at probes where both are
-valid. Differences are relative to the typical size of each rate.
+"""Compare the rates of two programs, or of a program and dense matrices, at probes where both are valid.
+Differences are relative to the typical size of each rate.
 """
 
 import jax
@@ -15,7 +15,7 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure
 
-DIFFERS = "differs from the dense path"
+DIFFERS = "differs from dense matrices"
 LIKELY = (
     "a body, load or constraint may have a kink there, or the constraints or the remaining inertia are nearly"
     " singular"
@@ -33,7 +33,7 @@ def values_at(found: Equations, probes: Probes) -> np.ndarray:
 
 
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
-    """Return whether two programs agree wherever the second is valid."""
+    """Return whether two programs agree wherever the second is valid, from their rates."""
     usable = all_finite(expected, axis=0)
     error = np.abs(values - expected)[:, usable]
     # tolerance 1e-9, relative to the size of each rate
@@ -41,26 +41,25 @@ def agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
-    """Return reference sizes for errors of rates (first axis) at probes: the largest value of each rate, and
-    0.01 of the largest rate at the probe, whose round-off elimination spreads over all rates.
+    """Return reference sizes for errors of rates (first axis) at probes: the largest value of each rate, plus
+    0.01 of the largest rate at the probe, because elimination spreads round-off over all rates.
     """
     usual = largest(rates, 1, keepdims=True)
     return usual + 0.01 * largest(rates, 0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
-    """Return whether a program is valid at enough of the probes: for long chains, few satisfy the
-    constraints.
+    """Return whether a program is valid at enough probes: at 12, or, if there are few probes, at half of
+    them. For long chains, few probes satisfy the constraints.
     """
-    # at least 12 probes, if so many exist
     return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
 
 
 def check_against_dense(
     scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray
 ) -> None:
-    """Raise `NotLowered` with the name of the worst rate if the program differs, at the probes, from JAX's
-    derivatives and a dense solution.
+    """Raise `NotLowered`, with the name of the worst rate, if the program differs at the probes from a
+    solution by dense matrices with JAX's derivatives.
     """
     probes, independent = builder.probes, tuple(builder.independent)
     leaves, treedef = jax.tree.flatten(scene)
@@ -81,9 +80,8 @@ def check_against_dense(
         for p, n in zip("qui", sizes, strict=True)
     )
     usable = all_finite(values, axis=0)
-    # above 5000 operations, fewer probes are compared with the dense path
+    # programs of more than 5000 operations are compared at 6 probes only
     large = builder.graph.operations(rates_of(found)) > 5000
-    # 6 probes for large programs
     chosen = np.flatnonzero(usable)[:6] if large else np.arange(probes.count)
     states = at_index((parameters, t, q, u, inputs), chosen)
     qdot, ydot, events = dense_rates(scene, structure, independent, *states)
@@ -93,7 +91,7 @@ def check_against_dense(
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
         raise NotLowered("its scalar program is valid at too few of the probed states")
-    # tolerance between the program, in double precision, and the dense path, relative to the size of each
+    # tolerance between the program, in double precision, and dense matrices, relative to the size of each
     # rate
     limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:

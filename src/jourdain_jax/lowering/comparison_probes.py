@@ -1,4 +1,4 @@
-"""Probes at which candidates of a scalar program are compared: states and parameters."""
+"""Make the probes, that is, states and parameters, at which candidates for a scalar program are compared."""
 
 import jax
 import numpy as np
@@ -16,13 +16,14 @@ from jourdain_jax.structure.trace import TracedScene, named_values
 def comparison_probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Return probes at random and symmetric configurations on the geometric constraints, with random speeds.
 
-    Parameters are up to a tenth larger than given, so that coincidences do not count. If the scene is
-    undefined for them, or its moments of inertia are impossible, they are nearer to the given ones.
+    Parameters are up to a tenth larger than given, so that equality by coincidence is not taken for an
+    identity. If the scene is undefined for these parameters, or its moments of inertia are impossible, they
+    are closer to the given ones.
     """
     generator = np.random.default_rng(1)
     # at most 56 probes
     t, q = structure.times[:56], np.array(structure.coordinates[:56], np.float64)
-    # in single precision norms of quaternions are one only to seven digits
+    # in single precision, norms of quaternions equal one only to seven digits
     for first, _ in scene.coordinates.quaternions:
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]

@@ -1,5 +1,5 @@
-"""Normal forms of switching contacts. Their responses are simplified once; loads, events, resets and starts
-then use the simple nodes.
+"""Simplify switching contacts by normal forms. Their responses are simplified once; loads, events, resets and
+starts then use the simplified nodes.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ MOST_TERMS = (8, 60)  # term limits to try
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Replace `responses` by normal forms. Responses at later states are functions of earlier ones and are
-    replaced, too. `forms`: function from a limit of terms to normal forms.
+    """Replace `responses` by normal forms. Responses at later states, which are functions of earlier
+    responses, are replaced, too. `forms`: function from a maximum number of terms to normal forms.
     """
     g, at = traced.graph, traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]

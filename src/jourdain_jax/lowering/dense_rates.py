@@ -1,4 +1,5 @@
-"""Rates of a scene by dense matrices on NumPy with JAX's derivatives, the reference for scalar programs.
+"""Compute the rates of a scene by dense matrices in NumPy, with JAX's derivatives, as a reference for scalar
+programs.
 
     beta, gamma, A          derivatives of v, omega, phi along each speed
     a_0, alpha_0, drift     derivatives along (1, qdot, 0)
@@ -29,11 +30,11 @@ from jourdain_jax.structure.trace import VelocityQuantities, jaxpr_of_scene
 def dense_rates(
     scene: Scene, structure: Structure, independent: Indices, parameters: Scene, t, q, u, inputs
 ) -> tuple[np.ndarray, ...]:
-    """Return rates of coordinates, rates of the independent speeds, and values of the stop events at many
+    """Return the rates of coordinates, the rates of the independent speeds, and the values of events, at many
     states. Rates are NaN if the accelerations are not unique.
 
-    All arrays, including parameters, have a leading axis of states. `independent`: speeds in the state; the
-    constraints determine the others.
+    All arrays, including parameters, have a leading axis of states. `independent`: indices of the speeds in
+    the state; the constraints determine the others.
     """
     closed, shape = jaxpr_of_scene(scene, structure.potentials_of_inputs)
     numbers: VelocityQuantities = jax.tree.unflatten(
@@ -51,7 +52,7 @@ def dense_rates(
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
 
     functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
-    # limit on states times directions computed at once
+    # limits the product of states and directions that are computed at once
     size = -(-len(t) // (1 + u.size // 4096))
     found = [
         _rates(functions, structure, independent, *at_index(states, slice(i, i + size)))
@@ -87,7 +88,7 @@ def _rates(
         A_z = A[:, :, dependent]
         u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
     qdot, omega, force, torque, direct, m, I, events, turns = values(parameters, t, q, u, inputs)
-    # with the same batch size, so that JAX traces this once
+    # with the same batch size as above, so that JAX traces the function once
     along = np.ones(states), qdot, np.zeros_like(u)
     rates = parted(slopes(*lanes(parameters, t, q, u, inputs, *along)))[1]
     a, alpha, drift = (x[:, 0] for x in rates)
@@ -101,9 +102,9 @@ def _rates(
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
-    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not unique.
+    """Solve `M udot - A' lambda = f`, `A udot = -drift` for udot at many states; NaN if udot is not unique.
 
-    `rank`: rank of the constraints. Eigenvalues beyond it are dropped, because coordinates rounded to single
+    `rank`: rank of the constraints. Further eigenvalues are ignored, because coordinates rounded to single
     precision make dependent constraints independent by about 1e-8.
     """
     c = speed_scales(M)

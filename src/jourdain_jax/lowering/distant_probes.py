@@ -1,6 +1,6 @@
-"""Probes outside the domain, with angles over full turns: a pivot that is large in the domain may vanish at
-another heading. Speeds satisfy the velocity constraints, since otherwise redundant constraints have no
-solution.
+"""Make probes outside the domain, with angles over full turns, because a pivot that is large in the domain
+may vanish at another heading. Speeds satisfy the velocity constraints; otherwise redundant constraints would
+have no solution.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from jourdain_jax.structure.trace import TracedScene
 
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
-    """Return a function that makes probes, on first use, with coordinates up to half a turn from the given
-    ones.
+    """Return a function that makes probes, on its first call, with coordinates up to half a turn from the
+    given ones.
 
-    They are projected onto the geometric constraints, NaN where this does not converge. Quaternions are
-    random.
+    Coordinates are projected onto the geometric constraints, and NaN where this does not converge.
+    Quaternions are random.
     """
     return cache(lambda: _at_full_turns(probes, traced))
 
@@ -43,7 +43,7 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     found = onto_rows(
         probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12
     )
-    off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also true where Gauss-Newton gave NaN
+    off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also true for NaN
     return found.probes.with_inputs(
         {name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved}
     )

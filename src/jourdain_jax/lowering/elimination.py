@@ -1,4 +1,4 @@
-"""Linear systems of nodes solved by unrolled elimination, with pivots chosen once (`pivots.py`)."""
+"""Solve linear systems of nodes by unrolled elimination, with pivots chosen once (`pivots.py`)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,13 +12,13 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes
 
-Rows = list[list[int]]  # of a matrix; each entry is a node
+Rows = list[list[int]]  # rows of a matrix whose entries are nodes
 
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Solution of `A x_k = b_k` as `solution[column][k]`, and the pivots that may vanish along the motion or
-    for some parameters.
+    """Solution of `A x_k = b_k` as `solution[column][k]`, and the pivots, which may vanish along the motion
+    or for some parameters.
     """
 
     solution: Rows
@@ -27,13 +27,13 @@ class Eliminated:
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """Return the probes at which division by these pivots is accurate: none is far below its typical size."""
+    """Return at which probes division by these pivots is accurate: none is far below its typical size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 
 
 def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
-    """Return the median of each value over the probes at which it is defined; NaN without any."""
+    """Return the median of each value over the probes at which it is defined; NaN if there are none."""
     known = np.any(~np.isnan(sizes), axis=1)
     found = np.full(len(sizes), np.nan)
     found[known] = np.nanmedian(sizes[known], axis=1)
@@ -43,10 +43,10 @@ def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"
 def eliminate(
     graph: Graph, A: Rows, right: Rows, probes: Probes, far: Callable[[], Probes] | None
 ) -> Eliminated:
-    """Return the solution of a system. `right[row]`: right-hand sides of a row. More rows than unknowns must
-    be consistent.
+    """Solve a linear system by elimination. `right[row]`: right-hand sides of a row. If there are more rows
+    than unknowns, the system must be consistent.
 
-    `far`: function that returns probes with angles of up to a full turn, called only if a pivot needs them.
+    `far`: function that returns probes with angles over full turns; it is called only if needed.
     """
     system = Pivots(graph, A, right, probes, far)
     count = len(system.columns)
@@ -70,12 +70,14 @@ def eliminate(
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:
-    """Return a/b as a times the reciprocal of b, which can be shared."""
+    """Return a/b as the product of a and the reciprocal of b, because several quotients can share the
+    reciprocal.
+    """
     return graph.mul(a, graph.div(graph.one, b))
 
 
 def solve_symmetric(graph: Graph, M: Rows, right: Rows) -> Eliminated:
-    """Return `M^-1 right` for a symmetric positive definite M by factorisation L D L'. `right` and the
+    """Solve a system with a symmetric positive definite matrix M by factorisation L D L'. `right` and the
     solution have one list per column; the pivots are D.
     """
     count = len(M)

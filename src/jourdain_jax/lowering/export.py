@@ -1,4 +1,4 @@
-"""Output of a lowered scene for readers: a summary, and the program as Python, C, SymPy or LaTeX."""
+"""Show a lowered scene: a summary, and the program as Python, C, SymPy or LaTeX."""
 
 import re
 
@@ -13,8 +13,8 @@ _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
 def summary(lowered) -> str:
-    """Return text: operations after each step, omitted parts with reasons, independent speeds, pivots and
-    guards, parameters with units.
+    """Return a text: number of operations after each step, omitted coordinates and constraints, JAX calls
+    with reasons, independent speeds, parameters with units, pivots and guards.
     """
     lines = [
         (
@@ -23,7 +23,7 @@ def summary(lowered) -> str:
         ),
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
-        f"  omitted, without influence on the accelerations: {', '.join(lowered.held) or 'nothing'}",
+        f"  omitted, because accelerations do not depend on them: {', '.join(lowered.held) or 'nothing'}",
         *(f"  kept as a JAX call, without scalar form: {reason}" for reason in lowered.calls),
         *([f"  redundant constraints omitted: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, kept as inputs (SI units and radians): {_parameters(lowered) or 'none'}",
@@ -47,8 +47,8 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """Return short nodes as expressions (up to 8, of at most 60 characters each), and the number of
-    others.
+    """Return a text of the short nodes as expressions (if at most 8 nodes, of at most 60 characters each),
+    and the number of other nodes.
     """
     names = identifiers(lowered)
     few = [n for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
@@ -60,7 +60,7 @@ def _shown(lowered, nodes) -> str:
 
 
 def _alone(graph, pivot: int) -> int:
-    """Return the varying factor of a scaled pivot, or the argument of a sign."""
+    """Return a pivot without its scale or sign function: the varying factor, or the argument of the sign."""
     args = graph.args[pivot]
     if graph.op[pivot] not in ("mul", "sign"):
         return pivot
@@ -82,7 +82,7 @@ def _speeds(lowered) -> list[str]:
 
 
 def identifiers(lowered) -> dict[int, str]:
-    """Return a unique readable name for every input of the program."""
+    """Return a unique, readable name for each input node of the program."""
     traced = lowered.traced
     named = [(traced.t, "t")]
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
@@ -110,7 +110,7 @@ def _identifier(name: str) -> str:
 
 
 def results(lowered) -> dict[str, int]:
-    """Return name -> node of every rate."""
+    """Return the nodes of all rates, by name."""
     rates = {f"d_{_identifier(name)}": n for name, n in zip(lowered.coordinates, lowered.qdot, strict=True)}
     return rates | {
         f"d_{_identifier(lowered.speeds[i])}": n
@@ -119,13 +119,15 @@ def results(lowered) -> dict[str, int]:
 
 
 def _prefix(letter: str, names) -> str:
-    """Return a prefix of numbered names that are not among the `names`."""
+    """Return a prefix for numbered names such that none of these is among `names`."""
     taken = any(re.fullmatch(rf"{letter}\d+", name) for name in names)
     return _prefix(letter + "_", names) if taken else letter
 
 
 def python_source(lowered) -> str:
-    """Return the source of two functions: values that depend on parameters only, and the rates."""
+    """Return Python source of two functions: one for values that depend on parameters only, one for the
+    rates.
+    """
     names, rates = identifiers(lowered), results(lowered)
     c, k, s = (_prefix(letter, names.values()) for letter in "cks")
     parameters = [names[int(n)] for nodes in lowered.traced.parameters for n in np.ravel(nodes)]
@@ -155,7 +157,7 @@ def python_source(lowered) -> str:
             "",
             f"def fixed({', '.join(parameters)}):",
             (
-                f'    """What depends on the parameters of {lowered.scene_name} alone: '
+                f'    """Values that depend only on parameters of {lowered.scene_name}: '
                 f'{_parameters(lowered) or "none"}."""'
             ),
             *first,
@@ -175,14 +177,14 @@ def python_source(lowered) -> str:
 
 
 def _conventions(lowered) -> str:
-    """Return units and axes as text that cannot end a docstring or comment."""
+    """Return units and axes as a text that cannot end a docstring or comment."""
     said = lowered.conventions.replace('"', "'").replace("*/", "").rstrip()
     return said if "SI units" in said else f"SI units, radians. {said}".rstrip()
 
 
 def c_source(lowered, name: str = "rates") -> str:
-    """Return one C function `void rates(parameters, t, coordinates, speeds, inputs, out)`; it needs the C
-    mathematical library.
+    """Return C source of the function `void rates(parameters, t, coordinates, speeds, inputs, out)`, which
+    needs the C mathematical library.
     """
     traced, rates = lowered.traced, results(lowered)
     names = {
@@ -238,7 +240,7 @@ def c_source(lowered, name: str = "rates") -> str:
 
 
 def expressions(lowered) -> dict:
-    """Return name -> SymPy expression of every rate, in the parameters and the state; requires SymPy."""
+    """Return SymPy expressions of all rates, by name, in the parameters and the state. Requires SymPy."""
     rates = results(lowered)
     return dict(
         zip(rates, sympy_expressions(lowered.graph, list(rates.values()), identifiers(lowered)), strict=True)
@@ -246,10 +248,9 @@ def expressions(lowered) -> dict:
 
 
 def latex(lowered) -> str:
-    """Return the equations for an `align` environment, with numbers rounded to six digits; requires SymPy.
+    """Return the equations for an `align` environment, with numbers rounded to six digits. Requires SymPy.
 
-    A speed that is the rate of a coordinate appears as the derivative of the coordinate, without an equation
-    of its own.
+    A speed that is the rate of a coordinate is written as the derivative of the coordinate.
     """
     import sympy
 
@@ -264,7 +265,7 @@ def latex(lowered) -> str:
         for n in (int(traced.u[i]) for i in lowered.independent)
     ]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
-    # round long fractions: 144952661367387/50000000000000, but not 9/2
+    # round long fractions such as 144952661367387/50000000000000, but not 9/2
     values = [
         value.replace(lambda x: x.is_Rational and x.q >= 1000, lambda number: sympy.Float(number, 6))
         for value in expressions(lowered).values()
@@ -277,8 +278,8 @@ def latex(lowered) -> str:
 
 
 def _symbol(name: str) -> str:
-    """Return a single Latin or Greek letter in italics, other words upright, each with its number as
-    subscript.
+    """Return the LaTeX of a name: single Latin or Greek letters in italics, other words upright, and a
+    trailing number as subscript.
     """
     import sympy
 

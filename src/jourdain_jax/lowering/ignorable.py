@@ -1,5 +1,5 @@
-"""Coordinates without influence on the accelerations of the independent speeds; programs fix them at the
-reference.
+"""Find ignorable coordinates, which do not affect the accelerations of the independent speeds. Programs fix
+them at their reference values.
 """
 
 from dataclasses import replace
@@ -14,21 +14,21 @@ from jourdain_jax.program.derivative import cotangents, on_its_own
 from jourdain_jax.program.identity_test import SURE, alike, equal, taken_for_what_they_are
 from jourdain_jax.scene.scene import Scene
 
-FEW = 6  # number of probes that suffices for most coordinates
+FEW = 6  # number of probes that suffices to test most coordinates
 
 
 def _with_slopes(
     builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray
 ) -> set[int]:
     """Return the coordinates (nodes) for which `sum w ydot`, with random weights w, has a nonzero derivative
-    at some generic probe. It may change values by less than round-off, as for the heading of the last of many
-    trailers.
+    at some generic probe. This also finds coordinates whose effect on values is less than round-off, such as
+    the heading of the last of many trailers.
 
     The set is empty if the derivatives contain operations that the identity test replaces.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
-    # the constraints fix all others
+    # the other coordinates are constant at the probes
     coordinates = [n for n in coordinates if n in set(inputs) and generic.varies(str(graph.value[n]))]
     if not coordinates or graph.calls(ydot):
         return set()
@@ -64,8 +64,8 @@ def ignorable(
         return bool(np.all(equal(elsewhere(equations.ydot), here, valid)))
 
     def surely_changed(groups) -> np.ndarray:
-        """Return which groups of coordinates influence the accelerations at a few probes. All groups are
-        tested at once, which finds nearly all groups of a long chain.
+        """Return which groups of coordinates affect the accelerations at a few probes. All groups are tested
+        in one evaluation. For a long chain, this finds nearly all groups that have an effect.
         """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
@@ -75,7 +75,7 @@ def ignorable(
         before = here[:, lanes]
         before.error = here.error[:, lanes]
         sizes = np.abs(elsewhere(equations.pivots))
-        # require pivots 100 times above the limit, so that they are valid whatever their typical size
+        # require pivots 100 times above the limit, because their typical size is known only roughly
         typical = usual(np.abs(generic(equations.pivots)))[:, None]
         far_from_singular = np.all(sizes > 100.0 * SMALLEST_PIVOT * typical, axis=0)
         return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
@@ -93,7 +93,7 @@ def ignorable(
     count_little = _with_slopes(builder, equations.ydot, alone, regular)
     left = [group for group in left if q[group[0]] not in count_little]
     together = [i for group in left for i in group]
-    # if all together have no effect, none has an effect
+    # if all groups together have no effect, no group has an effect
     if len(left) > FEW and unchanged(together) and regular_at_reference(together):
         return tuple(sorted([*held, *together]))
     for group in left:

@@ -1,5 +1,5 @@
-"""Constraints if all speeds are in the state. Multipliers enforce them, or independent speeds y if
-multipliers are not unique:
+"""Enforce constraints if all speeds are in the state: by multipliers, or, if multipliers are not unique, by
+independent speeds y:
 
     A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds z
     C' M C ydot = C' (f - M c)                                                                         (41)
@@ -21,8 +21,8 @@ from jourdain_jax.structure.structure import Structure
 
 
 class KeptRows:
-    """Treatment of constraints. `massless`: whether M may be singular; `probes` and, if necessary, `far`:
-    states at which the pivots of independent speeds are judged.
+    """Method to enforce constraints if all speeds are in the state. `massless`: whether M may be singular;
+    `probes` and, if needed, `far`: states at which the pivots of independent speeds are examined.
     """
 
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
@@ -32,7 +32,7 @@ class KeptRows:
 
     @property
     def description(self) -> str:
-        """Describe the treatment for the summary."""
+        """Describe the method for the summary."""
         if self.by_partition:
             return "all speeds in the state, accelerations from the independent ones"
         return "constraints enforced by multipliers" + (
@@ -42,7 +42,7 @@ class KeptRows:
     def accelerations(
         self, M: Columns, f: NodeList, A: Columns, drift: NodeList, forms: NormalForms
     ) -> Accelerations:
-        """Return the accelerations under all constraints, and the pivots."""
+        """Return the accelerations that satisfy all constraints, and the monitored pivots."""
         if self.by_partition:
             return self._accelerations_by_partition(M, f, A, drift, forms)
         return accelerations_by_multipliers(

@@ -1,4 +1,5 @@
-"""Kinks and jumps of loads and masses, from relations of the traced scene; no lowered program is needed.
+"""Detect kinks and jumps of loads and masses, from relations (`<`, `abs`, `floor`, ...) in the traced scene.
+No lowered program is needed.
 
 Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
 """
@@ -23,8 +24,8 @@ def loads_have_relations(scene: Scene) -> bool:
 
 
 def loads_may_jump(scene: Scene) -> bool:
-    """Return whether loads or masses jump at a state or parameter. Jumps at fixed times do not count:
-    derivatives are correct there.
+    """Return whether loads or masses jump at some state or parameter. Jumps at fixed times do not count,
+    because derivatives are correct there.
     """
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
@@ -39,7 +40,7 @@ def loads_may_jump(scene: Scene) -> bool:
 
 
 def bent_load(scene: Scene, t, q, u, inputs) -> str:
-    """Describe a load or mass without a derivative with respect to the state here; empty if there is none."""
+    """Return the name of a load or mass that has no derivative at this state; empty if all have one."""
     try:
         traced = looked_at(scene).traced
     except Unsupported:
@@ -64,7 +65,7 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
 
 
 def _probes(scene: Scene, traced: TracedScene) -> Probes:
-    """Return the states that determined the structure of the scene, with random speeds and inputs."""
+    """Return probes at the states used to determine the scene's structure, with random speeds and inputs."""
     known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
     u, inputs = (
         generator.normal(size=(len(known.times), len(names)))
@@ -74,6 +75,6 @@ def _probes(scene: Scene, traced: TracedScene) -> Probes:
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
-    """Return a dictionary: nodes of loads and masses -> their names."""
+    """Return the names of loads and masses, by node."""
     names = "force", "torque", "mass", "inertia", "direct"
     return owned(scene, **{name: getattr(traced.at, name) for name in names})

@@ -1,5 +1,5 @@
-"""Lowered equations of a scene. Several candidates are built and compared with each other and with dense
-matrices; the one with the fewest operations is kept. If lowering fails, the reason is reported.
+"""Lower a scene: build several candidate programs, compare them with each other and with dense matrices, and
+keep the one with the fewest operations. If lowering fails, the reason is reported.
 """
 
 import time
@@ -32,14 +32,15 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.structure.trace import Variables, traced_scene
 
-# Maximum number of operations of the program before simplification; scenes beyond it use dense matrices. With
-# XLA, a program of this size compiles a minute longer than dense matrices (24 joint angles, 20,762
-# operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (0.22 in a batch). Smaller programs
-# are always faster (bench/README.md). As machine code, larger programs are faster, too: a quadruped of 20,550
-# operations takes 11 s of processor time to the first motion (dense matrices 50 s), then 0.02 s (5.5 s).
-# Machine code is limited to 60,000 operations, integration steps included.
+# Maximum numbers of operations of a program before simplification, with XLA and with machine code. Larger
+# scenes use dense matrices. With XLA, a program of 20,000 operations takes about a minute longer to compile
+# than dense matrices (24 joint angles, 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of
+# their time (0.22 in a batch). Smaller programs are always faster (bench/README.md). With machine code,
+# larger programs are faster, too: a quadruped of 20,550 operations takes 11 s of processor time to the first
+# motion (dense matrices 50 s), then 0.02 s (5.5 s). Machine code is limited to 60,000 operations, integration
+# steps included.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
-MOST_TERMS = 200  # of one normal form
+MOST_TERMS = 200  # maximum number of terms of one normal form
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
@@ -47,7 +48,7 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     once per class, shapes and independent speeds.
 
     `every_speed`: whether all speeds stay in the state, with multipliers for the constraints (default: only
-    if no independent speeds are valid everywhere).
+    if no choice of independent speeds is valid everywhere).
     """
     structure = structure_of(scene)
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
@@ -62,15 +63,15 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
-    """Return the lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout`
-    integrate. Raises `NotLowered` with the reason.
+    """Return the lowered equations of the class of `scene`: the scalar program that `simulate` and `rollout`
+    integrate. Raises `NotLowered`, with the reason, if there is none.
 
-        print(jj.lower(disc))                     operations after each step, what was dropped and why
+        print(jj.lower(disc))                     operations after each step, omitted parts
         print(jj.lower(disc).python_source())     also c_source(), expressions() and latex() (SymPy)
 
-    `every_speed`: True keeps all speeds in the state, with multipliers for the constraints; False
-    eliminates dependent speeds. By default they are eliminated if some independent speeds are valid
-    everywhere in the scene's domain.
+    `every_speed`: True keeps all speeds in the state, with multipliers for the constraints; False eliminates
+    dependent speeds. By default they are eliminated if some choice of independent speeds is valid everywhere
+    in the scene's domain.
     """
     scene = as_scene(scene)
     found = lowered(scene, every_speed)
@@ -81,7 +82,7 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
 
 @once_per_class
 def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
-    """Return the program. It depends on the `kept` part of the structure, but not on parameter values."""
+    """Return the program. It depends on the part `kept` of the structure, but not on parameter values."""
     begin = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # probes with undefined values are ignored
@@ -110,11 +111,11 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
             for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist())
         )
         if loop := next(filter(None, loops), None):
-            # measured: a ball on a hill, with a contact point by Newton's method, takes four times as long as
-            # with dense matrices
+            # because of a measurement: a ball on a hill, whose contact point is found by Newton's method,
+            # takes four times as long as with dense matrices
             raise Unsupported(f"the operation `{loop}`")
         probes = comparison_probes(scene, structure, traced)
-        # off the velocity constraints, redundant ones contradict each other
+        # at states that violate the velocity constraints, redundant constraints contradict each other
         if every_speed and len(structure.row_names) > structure.rank:
             probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
@@ -145,7 +146,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         Stage("scalar program: structural zeros and ones removed, common subexpressions shared", fewest)
     ]
     plainly_held = fewest
-    # above 4000 operations, fixing ignorable coordinates never yields a small program
+    # if there are more than 4000 operations, fixing ignorable coordinates never yields a small program
     if held and fewest < 4000:
         plainly_held = graph.operations(rates_of(builder.build(replace(first, held=held))))
         stages.append(Stage("ignorable coordinates fixed in the accelerations", plainly_held))
@@ -179,7 +180,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
     given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist()]
     given += [n for x in own.parameters for n in x.ravel().tolist()]
-    # without the failed candidates
+    # on a new graph, without the nodes of other candidates
     alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
     place = places.tolist()
     names = scene.coordinate_names.entries
@@ -240,8 +241,8 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
 
 
 def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
-    """Return the divisors in the coordinate rates, such as sin q in w/sin q. Divisors that a `where` keeps
-    from zero do not count.
+    """Return the divisors in the coordinate rates, such as sin q in w/sin q. Divisors that `where` keeps away
+    from zero are omitted.
     """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
@@ -250,9 +251,9 @@ def _divisors(graph: Graph, qdot: NodeList) -> NodeList:
 
 
 def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int) -> Iterator[Strategy]:
-    """Yield the strategies worth trying; `plainly`: operations without normal forms.
+    """Yield the strategies worth trying. `plainly`: number of operations without normal forms.
 
-    No other of twelve strategies took fewer operations for any model, with eliminated speeds or all speeds.
+    Of twelve strategies, no other gave fewer operations for any model, with eliminated speeds or all speeds.
     """
     if builder.multiplied:
         yield Strategy(True, MOST_TERMS, MOST_TERMS if small else 0, held=held)
@@ -261,7 +262,7 @@ def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int
         yield Strategy(False, MOST_TERMS, MOST_TERMS, by_determinants=True, held=held)
     else:
         yield Strategy(False, MOST_TERMS, held=held)
-        # try the explicit strategy only up to 5000 operations
+        # for larger programs, the explicit strategy is not tried
         if plainly > 5000:
             return
         if builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
@@ -269,8 +270,8 @@ def _strategies(builder: AppellOnGraph, held: Indices, small: bool, plainly: int
 
 
 def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
-    """Return pivots relative to their values at a probe with the same parameters; of constant pivots, the
-    signs.
+    """Return the pivots divided by their values at a probe with the same parameters. Constant pivots are
+    replaced by their signs.
     """
     return [
         graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots
@@ -278,19 +279,19 @@ def _relative(graph: Graph, probes: Probes, pivots: NodeList) -> NodeList:
 
 
 def _operands(graph: Graph, call: int) -> NodeList:
-    """Return the scalar operands of a call, without results of other calls."""
+    """Return the scalar operands of a call, excluding results of other calls."""
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
 def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeList:
     """Merge calls that compute equal values."""
     graph = generic.graph
-    # so that no call is replaced by one that depends on it
+    # sorted, so that no call is replaced by a call that depends on it
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))
     kept: dict = {}
     same: dict[int, int] = {}
     for call in calls:
-        # array operands from other calls must be identical, not only of equal shape
+        # array operands that come from other calls must be the same calls, not only of equal shape
         whole = tuple(
             (graph.value[a], *(same.get(other, other) for other in graph.args[a] if graph.op[a] != "array"))
             for a in graph.args[call]
@@ -308,11 +309,12 @@ def _with_equal_calls_once(generic: IdentityProbes, outputs: NodeList) -> NodeLi
 
 
 def may_be_massless(scene: Scene, structure: Structure) -> bool:
-    """Return whether M is singular at the parameters of `scene`, with traced parameters of zero if they may
-    be zero.
+    """Return whether M is singular at the parameters of `scene`, if traced parameters are set to zero where
+    they may be zero.
 
-    These are parameters declared `non_negative` or with default zero. With well conditioned independent
-    speeds all parameters that are not declared `positive` become zero: a singular M then costs nothing.
+    These are parameters that are declared `non_negative` or have the default zero. If independent speeds are
+    well conditioned, all parameters that are not declared `positive` are set to zero, because a singular M
+    then costs nothing.
     """
     if structure.massless:
         return True
@@ -321,12 +323,14 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
         return False
     try:
         return structure_of(without).massless
-    except ValueError:  # they cannot all be zero at once, but some may
+    except ValueError:  # all of them cannot be zero at once, but some may be zero
         return True
 
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
-    """Return the scene with concrete parameters and all permitted zeros; None without any."""
+    """Return the scene with concrete parameters, zero where this is permitted; None if no parameter may be
+    zero.
+    """
     may_vanish = {
         f.name
         for f in fields(scene)

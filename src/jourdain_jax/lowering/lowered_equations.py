@@ -1,4 +1,4 @@
-"""Lowered equations of a scene: the chosen program, its outputs, and its execution in JAX."""
+"""Lowered equations of a scene: the scalar program, its outputs, and its execution in JAX."""
 
 import functools
 import importlib.util
@@ -22,7 +22,7 @@ from jourdain_jax.structure.trace import Variables
 
 Nodes = tuple[int, ...]  # node indices
 
-# Fields of a program that hold nodes; `power` is another one.
+# fields of a program that contain nodes, except `power`
 NODES = (
     *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
     *("projected_q", "projected_u", "relations", "event_relations", "sided", "jumps"),
@@ -30,7 +30,7 @@ NODES = (
 
 
 class NotLowered(Exception):
-    """Raised with the reason why a scene cannot be lowered."""
+    """Error raised if a scene cannot be lowered, with the reason."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
-    """Rates of the minimal state (q, y), or of the full state (y = u), of a class of scenes, as a scalar
-    program. Its inputs include the parameters.
+    """Scalar program for the rates of the minimal state (q, y), or of the full state (y = u), of a class of
+    scenes. Its inputs include the parameters.
 
-    Compared by identity, so that it can be a static argument of compiled functions.
+    Programs are compared by identity, so that they can be static arguments of compiled functions.
     """
 
     traced: Variables
@@ -59,39 +59,40 @@ class Lowered:
     inputs: Labels
     independent: Nodes
     dependent: Nodes
-    qdot: Nodes  # nodes
+    qdot: Nodes
     ydot: Nodes
     z: Nodes  # dependent speeds
-    # must keep their signs, relative to their size at a probe; divisors of coordinate rates come first
+    # relative to their size at a probe; must keep their signs. Divisors of coordinate rates come first
     pivots: Nodes
     divisors: int  # number of these divisors
-    directions: Nodes  # of constraints nonlinear in the speeds, one entry per speed: must not reverse
+    directions: Nodes  # of constraints nonlinear in the speeds, one entry per speed; must not reverse
     # for each constraint with a multiplier: its remainder after elimination of the earlier ones, and its
     # size; the ratio is a squared sine
     squares: Nodes
     guards: Nodes  # must stay positive
-    power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or the integrated part of it)
-    events: Nodes  # values of the stop events, sorted by name; empty without scalar form
-    # per event: coordinates, speeds of the state, modes, and gain of the energy stored in loads; empty if
-    # all events stop the motion
+    power: int  # `rate_of_work`: d(T + V)/dt at constant inputs, or the part of it that is integrated
+    events: Nodes  # values of the events, sorted by name; empty if they have no scalar form
+    # values after each event: coordinates, speeds of the state, modes, and the gain of the energy stored in
+    # loads; empty if all events stop the motion
     resets: Nodes
     stops: tuple[bool, ...]  # whether each event stops the motion
     energies: Nodes  # kinetic and potential
     relations: Nodes  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
-    event_relations: Nodes  # further such numbers of the stop events
-    sided: Nodes  # signs whose branches both continue beyond the zero (`lowering/sides.py`)
-    jumps: Nodes  # relations at whose zeros rates may jump
+    event_relations: Nodes  # further such numbers, of the events
+    sided: Nodes  # such numbers whose branches are both defined beyond the zero (`lowering/sides.py`)
+    jumps: Nodes  # such numbers at whose zeros rates may jump
     projected_q: Nodes  # coordinates projected onto norms and geometric constraints, one step of Gauss-Newton
     projected_u: Nodes  # all speeds projected onto the constraints; empty if dependent speeds are eliminated
-    at_start: Nodes  # switching contacts at the start of a motion: `switching.Begun`
+    at_start: Nodes  # switching contacts at the start of a motion (`contacts_at_start`)
     by_partition: bool  # all speeds are in the state, but the accelerations come from independent ones
     left_out: Labels  # redundant constraints
-    held: Labels  # ignorable coordinates, fixed at the reference in the accelerations
+    held: Labels  # ignorable coordinates, which have reference values in the accelerations
     stages: tuple[Stage, ...]
     way: str  # description of the strategy with the fewest operations
     seconds: float  # duration of lowering
     fixed: Nodes  # nodes that depend only on parameters, computed once per motion
-    sides: tuple[bool, ...]  # of relations, the last modes and events: whether each has integer sides
+    # whether each relation has integer sides (`floor`, `ceil`); relations are the last modes and events
+    sides: tuple[bool, ...]
 
     @property
     def graph(self) -> Graph:
@@ -104,7 +105,9 @@ class Lowered:
         return self.graph.operations([*self.qdot, *self.ydot])
 
     def summary(self) -> str:
-        """Return text: operations after each step, omitted parts with reasons, and the independent speeds."""
+        """Return a text: numbers of operations, omitted parts, JAX calls, independent speeds, pivots and
+        guards.
+        """
         return export.summary(self)
 
     def __str__(self) -> str:
@@ -117,26 +120,26 @@ class Lowered:
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """Return the program as one C function `name`, in SI units and radians, with a comment on its
+        """Return the program as a C function `name`, in SI units and radians, with a comment on its
         arguments.
         """
         return export.c_source(self, name)
 
     def expressions(self) -> dict:
-        """Return name -> SymPy expression of every rate; requires SymPy. Use it for small scenes only: large
-        ones have expressions of many pages.
+        """Return SymPy expressions of all rates, by name. Requires SymPy. For large scenes, expressions fill
+        many pages.
         """
         return export.expressions(self)
 
     def latex(self) -> str:
-        """Return one equation per rate for an `align` environment, with numbers of six digits; requires
+        """Return one equation per rate for an `align` environment, with numbers of six digits. Requires
         SymPy.
         """
         return export.latex(self)
 
     def _repr_latex_(self) -> str | None:
-        """Return the equations for display in a notebook. Return None, which shows the summary, for more than
-        100 operations or without SymPy.
+        """Return the equations for display in a notebook. For more than 100 operations, or without SymPy,
+        return None, so that the summary is displayed.
         """
         if self.operations > 100 or importlib.util.find_spec("sympy") is None:
             return None
@@ -157,7 +160,7 @@ class Lowered:
             args = self.graph.args[n]
             whole = self.graph.op[n] == "array" and all(a in place for a in args)
             owners = {place[a][0] for a in args} if whole else ()
-            if len(owners) == 1:  # entries of one parameter, read in one operation
+            if len(owners) == 1:  # read all entries of one parameter in one operation
                 entries = leaves[owners.pop()][np.array([place[a][1] for a in args])]
                 known[n] = entries.reshape(self.graph.value[n][0])
         for n in self.graph.needed(self.fixed, known):
@@ -169,17 +172,17 @@ class Lowered:
     def rates(
         self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False
     ) -> tuple[tuple, tuple, PerLane | None]:
-        """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`; NaN if a guard is
-        not positive.
+        """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`. The first entry of
+        `qdot` is NaN if a guard is not positive.
 
-        `fixed`: from `fixed_values`; `q`, `y`: coordinates and independent speeds, one scalar (or batch)
+        `fixed`: result of `fixed_values`; `q`, `y`: coordinates and independent speeds, one scalar (or batch)
         each; `inputs`: a vector.
         """
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return the results of `rates`, the pivots, the directions of constraints, and the sine of the
-        smallest angle of a constraint with multiplier to the span of those before it (None without
+        """Return the results of `rates`, the pivots, the directions of constraints, and a sine: the smallest
+        sine of the angle between a constraint with multiplier and the span of the earlier ones (None without
         multipliers). Pivots must keep their signs. Only the rates have derivatives.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
@@ -202,8 +205,8 @@ class Lowered:
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
     def speeds_and_pivot(self, *state) -> tuple[Float[Array, "speeds *lanes"], PerLane | None]:
-        """Return all speeds and the smallest pivot, which changes sign where the elimination fails; `state`:
-        as in `rates`.
+        """Return all speeds and the smallest pivot, which changes its sign where the elimination fails.
+        `state`: arguments of `rates`.
         """
         return self.all_speeds(*state), smallest_pivot(self.values(self.pivots, *state))
 
@@ -214,14 +217,14 @@ class Lowered:
         return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
     def energies_at(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
-        """Return the kinetic and potential energy, J, without derivatives. `fixed`, `q`, `y`, `inputs`: as in
-        `rates`.
+        """Return the kinetic and potential energy (J), which have no derivatives. `fixed`, `q`, `y`,
+        `inputs`: as in `rates`.
         """
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
         """Project coordinates and integrated speeds onto the constraints. `affine`: constraints are affine in
-        the speeds, so one step is exact.
+        the speeds, so that one step is exact.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
@@ -233,7 +236,7 @@ class Lowered:
                 for x in run(self.graph, nodes, self._known(fixed, t, q, y, inputs))
             )
 
-        # two steps: the deviation after an integration step is small, and its square is round-off
+        # two steps suffice: the deviation after an integration step is small, and its square is round-off
         q = jax.lax.scan(lambda q, _: (step(self.projected_q, q, y), None), tuple(q), length=2)[0]
         if not self.projected_u:
             return q, y
@@ -241,7 +244,7 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=steps)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers whose signs are monitored during every step: of the rates and, with
+        """Return the numbers of relations whose signs are monitored: those of the rates and, with
         `has_events`, of the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
@@ -249,7 +252,7 @@ class Lowered:
     def values(
         self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs
     ) -> Float[Array, "nodes *lanes"]:
-        """Return values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
+        """Return the values of `nodes`. `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
         if not nodes:
             return jnp.zeros((0, *like.shape), like.dtype)
@@ -265,7 +268,7 @@ class Lowered:
 
     @property
     def calls(self) -> Labels:
-        """Return the reason for each JAX call in the rates and stop events: a part of a load or event without
+        """Return the reason for each JAX call in the rates and events: a part of a load or event that has no
         scalar form.
         """
         calls = self.graph.calls([*self.qdot, *self.ydot, *self.events])
@@ -282,8 +285,8 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
 
 
 def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane | None:
-    """Return the smallest magnitude of several numbers, at most 1, with the sign of their product; None
-    without numbers.
+    """Return the smallest magnitude of the pivots, at most 1, with the sign of their product; None if there
+    are none.
     """
     if not len(pivots):
         return None

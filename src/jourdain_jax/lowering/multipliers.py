@@ -1,20 +1,20 @@
-"""Constraints enforced by multipliers, and projected states, on the graph; all speeds stay in the state.
+"""Enforce constraints by multipliers, and project states, on the graph. All speeds stay in the state.
 
     M udot = f + A' lambda,   A udot = -drift          S lambda = -(drift + A M^-1 f),   S = A M^-1 A'
     q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
     u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact if the constraints are affine in the speeds
 
 S is symmetric, positive definite if the constraints are independent, and sparse: tridiagonal for a chain.
-Elimination leaves a remainder of each diagonal entry of S. Relative to the entry, it is the squared sine of
-the angle between this constraint and the earlier ones. A square of 1e-k costs accelerations k digits.
+Elimination leaves a remainder of each diagonal entry of S. The ratio of remainder and entry is the squared
+sine of the angle between this constraint and the earlier ones. If it is 1e-k, accelerations lose k digits.
 
 A constraint whose row vanishes at some configuration has a small entry instead of a small angle. Entries are
 therefore bounded from below by their size at a probe with the same parameters (`Probes.in_the_middle`). The
-entry of a constraint nonlinear in the speeds may be small. Such a constraint is lost where the remainder of
-its row, a row of L^-1 A, passes through zero and reverses.
+entry of a constraint that is nonlinear in the speeds may be small, though. Such a constraint becomes
+undetermined where the remainder of its row, a row of L^-1 A, passes through zero and reverses.
 
-If M is singular but every admissible velocity has inertia, M + A' W A replaces M, with positive weights W.
-This changes only the multipliers, because A udot is prescribed.
+If M is singular but every admissible velocity has inertia, M is replaced by M + A' W A with positive weights
+W. This changes only the multipliers, because A udot is prescribed.
 """
 
 from typing import NamedTuple
@@ -35,10 +35,10 @@ class Accelerations(NamedTuple):
     """Accelerations and monitored quantities."""
 
     udot: NodeList
-    sines: NodeList  # of the angles between constraints and earlier ones; or pivots of independent speeds
-    margins: NodeList  # must stay positive: remainder of each entry minus its lower limit
-    directions: Columns = []  # of constraints, must not reverse within a step
-    squares: NodeList = []  # per constraint: remainder of its entry, and its size
+    sines: NodeList  # of angles between each constraint and the earlier ones; or pivots of independent speeds
+    margins: NodeList  # remainder of each entry minus its lower limit; must stay positive
+    directions: Columns = []  # of constraints; must not reverse within a step
+    squares: NodeList = []  # for each constraint: the remainder of its entry, and its size
 
 
 def accelerations_by_multipliers(
@@ -52,15 +52,15 @@ def accelerations_by_multipliers(
     *,
     affine: bool,
 ) -> Accelerations:
-    """Return the accelerations under all constraints. `probes` give the typical sizes of entries; `affine`:
-    whether constraints are affine in the speeds.
+    """Return the accelerations that satisfy all constraints. `probes` give the typical sizes of entries;
+    `affine`: whether constraints are affine in the speeds.
     """
-    # M^-1 A' column by column, M^-1 f
+    # columns of M^-1 A', and M^-1 f
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
         alone = all(S[r][s] == graph.zero for s in range(len(A)) if s != r)
-        if alone and not graph.varies[S[r][r]]:  # scale by the entry where that costs nothing
+        if alone and not graph.varies[S[r][r]]:  # scale by the entry if this costs nothing
             impulses[r] = [forms.simplified(quotient(graph, n, S[r][r])) for n in impulses[r]]
             S[r][r] = graph.one
     right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
@@ -71,7 +71,7 @@ def accelerations_by_multipliers(
     sines = [
         graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left
     ]
-    # least relative sine or length; below it round-off decides how a motion continues
+    # square of the smallest sine or relative length; below it, round-off decides how a motion continues
     least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
@@ -85,7 +85,7 @@ def accelerations_by_multipliers(
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
     """Return `M + A' W A`, which is positive definite if every admissible velocity has inertia. The added
-    inertia has the size of M.
+    inertia has about the size of M.
     """
     made, speeds = [list(row) for row in M], range(len(M))
     heavy = np.nanmedian(largest(probes([row[i] for i, row in enumerate(M)]), 0))
@@ -100,7 +100,7 @@ def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -
 
 
 def projected_coordinates(graph: Graph, q: NodeList, closure: NodeList) -> NodeList:
-    """Return one step of Gauss-Newton towards `closure = 0`."""
+    """Return the coordinates after one Gauss-Newton step towards `closure = 0`."""
     G = matrix(graph, closure, q)
     correction = solve_symmetric(graph, _products(graph, G, G, NormalForms(graph, 0)), [closure]).solution[0]
     return _less(graph, q, G, correction)
@@ -121,7 +121,7 @@ def _less(graph: Graph, x: NodeList, rows: Columns, factors: NodeList) -> NodeLi
 
 
 def _products(graph: Graph, A: Columns, X: Columns, forms: NormalForms) -> Columns:
-    """Return the symmetric product `A X'`; entries are zero if no speed is shared."""
+    """Return the symmetric product `A X'`."""
     S = [[graph.zero] * len(A) for _ in A]
     used = [[k for k, n in enumerate(row) if n != graph.zero] for row in A]
     for r in range(len(A)):

@@ -1,9 +1,9 @@
-"""Velocities v, omega, partial velocities beta, gamma and accelerations a_0, alpha_0 at ydot = 0 of the
-bodies, as scalar expressions.
+"""Derive scalar expressions for the velocities v, omega of the bodies, their partial velocities beta, gamma,
+and their accelerations a_0, alpha_0 at ydot = 0.
 
 *Explicit*: substitute the dependent speeds z(q, y) into the velocities, then differentiate. Best if z is
-simple. *Implicit*: differentiate the velocities as functions of all speeds, with zdot from the constraints'
-derivative.
+simple. *Implicit*: differentiate the velocities as functions of all speeds, and compute zdot from the
+derivative of the constraints.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ IN_EQUATIONS = ("mass", "inertia", "qdot", "force", "torque", "direct", "power")
 
 
 class Kinematics:
-    """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates fixed."""
+    """Velocities, partial velocities and accelerations at ydot = 0. Coordinates in `held` are fixed."""
 
     def __init__(
         self,
@@ -47,7 +47,8 @@ class Kinematics:
         partial = [self._simple(column) for column in columns(self.graph, simple, self.y)]
         self._shape(simple, partial, self._along(simple, raw, self.qdot))
 
-    # Implicit: differentiate the velocities in all speeds, and the constraints through body velocities.
+    # Implicit: differentiate the velocities with respect to all speeds, and the constraints through body
+    # velocities.
 
     def _implicitly(self) -> None:
         g, build, at = self.graph, self.build, self.build.traced.at
@@ -70,7 +71,7 @@ class Kinematics:
         put = self._cut(levels)
         self._put = put
 
-        # velocities are replaced in every direction, and change in few of them
+        # velocities are replaced for all directions, but change along few of them
         directions: dict = {
             None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])
         }
@@ -140,20 +141,22 @@ class Kinematics:
         self.known = dict(zip([self.u[d] for d in build.dependent], self.z, strict=True))
 
     def rows_along_motion(self, rows: NodeList) -> tuple[list[NodeList], NodeList]:
-        """Return the Jacobian (by speeds) and the drift of some constraints, at the fixed coordinates."""
+        """Return the Jacobian with respect to the speeds and the drift of some constraints, with the fixed
+        coordinates.
+        """
         raw = [int(self.build.traced.at.phi[s]) for s in rows]
         simple = self._at(raw)
         by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
         return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
     def rates_along_motion(self, raw: NodeList) -> NodeList:
-        """Return rates of traced nodes along the motion, at the fixed coordinates."""
+        """Return the rates of traced nodes along the motion, with the fixed coordinates."""
         return self._along(self._at(raw), raw, self.qdot)
 
     # helpers
 
     def _at(self, nodes) -> NodeList:
-        """Return nodes at the fixed coordinates, simplified."""
+        """Substitute the fixed coordinates into nodes, and simplify them."""
         return self._simple(self.graph.substituted(nodes, self.held))
 
     def _turned(self, R, w) -> NodeList:
@@ -165,7 +168,7 @@ class Kinematics:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
     def _cut(self, levels) -> dict[int, int]:
-        """Return a dictionary: traced nodes that vary -> replacements (zero if none is given)."""
+        """Return replacements for those traced nodes that vary, by node. Values None mean zero."""
         pairs: dict[int, int] = {}
         for nodes, values in levels:
             flat = np.ravel(nodes).tolist()
@@ -179,7 +182,7 @@ class Kinematics:
         return pairs
 
     def _along(self, nodes, raw, qdot) -> NodeList:
-        """Return the rate of `nodes` along the motion; `raw`: the nodes before fixing coordinates."""
+        """Return the rates of `nodes` along the motion. `raw`: the same nodes without fixed coordinates."""
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
         rates = derivatives(
@@ -193,13 +196,15 @@ class Kinematics:
         return self._simple(rates)
 
     def _velocities(self, replacement) -> tuple[NodeList, NodeList]:
-        """Return v and omega of all bodies in one list, raw and simplified at the fixed coordinates."""
+        """Return v and omega of all bodies in one list, first as traced, then simplified with the fixed
+        coordinates.
+        """
         at = self.build.traced.at
         raw = self.graph.substituted([*at.v.ravel().tolist(), *at.omega.ravel().tolist()], replacement)
         return raw, self._at(raw)
 
     def _quantities(self) -> None:
-        """Evaluate the quantities in the equations at the dependent speeds and the fixed coordinates."""
+        """Substitute the dependent speeds and the fixed coordinates into the quantities of the equations."""
         at, g = self.build.traced.at, self.graph
 
         def put(nodes):
@@ -210,7 +215,7 @@ class Kinematics:
         self.qdot = self.at.qdot.tolist()
 
     def _parts(self, nodes) -> tuple[list, list]:
-        """Return linear and angular parts per body."""
+        """Split a list into the linear and the angular parts of all bodies."""
         rows = np.array(nodes, np.int64).reshape(2, len(self.build.traced.at.mass), 3).tolist()
         return rows[0], rows[1]
 

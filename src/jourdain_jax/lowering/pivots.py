@@ -1,16 +1,18 @@
-"""Pivots for eliminating a linear system of nodes, chosen to be large wherever the system itself is regular.
+"""Choose pivots to eliminate a linear system of nodes, such that they are large wherever the system itself is
+regular.
 
 A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first.
-Other pivots are judged by their smallest value over all probes, relative to their row. Among good pivots, the
+Other pivots are rated by their smallest value over all probes, relative to their row. Among good pivots, the
 one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
-eliminated together if their determinant cannot vanish. Components of the velocity of a hitch in rotated axes
-are an example: each entry is zero at some angle, but the determinant depends only on parameters.
+eliminated together if their determinant cannot vanish. An example are components of the velocity of a hitch
+in rotated axes: each entry is zero at some angle, but the determinant depends only on parameters.
 
-If no order of elimination works, rows are combined. The rows a_1, a_2, ... of one column give one row with
-the pivot sum w_i a_i^2, and the others are made orthogonal to it. The constraints of a rolling wheel along
-the world axes thus become constraints along and across its heading. In exact arithmetic, this pivot is the
-squared distance of its column from the earlier ones, at least the smallest singular value squared. It remains
-valid with more rows than unknowns even if each row vanishes somewhere.
+If no order of elimination works, rows are combined. The rows with entries a_1, a_2, ... in one column give
+one row with the pivot sum w_i a_i^2, and the other rows are made orthogonal to it. For example, the
+constraints of a rolling wheel along the world axes become constraints along and across its heading. In exact
+arithmetic, such a pivot is the squared distance of its column from the earlier columns, which is at least the
+smallest singular value squared. It is valid also for more rows than unknowns, even if each row vanishes
+somewhere.
 """
 
 from collections import Counter
@@ -26,8 +28,8 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
 
-GOOD = 0.02  # smallest acceptable pivot relative to its row, at the worst probe
-FEW = 12  # number of equations up to which the choice of a pivot counts its operations
+GOOD = 0.02  # smallest acceptable pivot, relative to its row, at the worst probe
+FEW = 12  # for at most this number of equations, the choice of a pivot depends on its number of operations
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class _Entry:
 
 
 class Pivots:
-    """System `A x = right` during elimination, and the choice of the next pivot. `probes`: states in the
-    domain; `far`: function that returns states with angles over full turns.
+    """System `A x = right` during elimination, which chooses the next pivot. `probes`: states in the domain;
+    `far`: function that returns states with angles over full turns.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class Pivots:
         probes: Probes,
         far: Callable[[], Probes] | None,
     ):
-        # at most 32 terms of a determinant in normal form
+        # determinants in normal form have at most 32 terms
         self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, 32, sign=probes.sign)
         self.A, self.right = [list(row) for row in A], [list(row) for row in right]
         self.rows, self.columns = set(range(len(self.A))), set(range(len(self.A[0]) if self.A else 0))
@@ -71,7 +73,7 @@ class Pivots:
         self._sizes: dict[int, np.ndarray] = {}  # size of the terms of each row
         self._entries: dict[int, list[int]] = {}  # columns with structurally nonzero entries, by row
         self._judged: dict[int, dict[int, _Entry]] = {}
-        # two rows, two columns -> determinant; None if it is no pivot
+        # determinant by its four entries; None if it is not acceptable as a pivot
         self._determinants: dict[tuple[int, int, int, int], int | None] = {}
 
     def eliminated(self, pivot: Pivot) -> None:
@@ -97,7 +99,7 @@ class Pivots:
                 ]
 
     def _changed(self, *rows: int) -> None:
-        """Clear cached results of these rows, or of all rows."""
+        """Clear cached results of these rows; without arguments, of all rows."""
         for row in rows or list(self._entries):
             self._entries.pop(row, None)
             self._judged.pop(row, None)
@@ -139,7 +141,7 @@ class Pivots:
         return self._by_column((r, c))
 
     def _judged_row(self, row: int) -> dict[int, "_Entry"]:
-        """Return the judged entries of a row by column, cached until the row changes."""
+        """Return the quality of the entries of a row, by column. It is cached until the row changes."""
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
@@ -165,12 +167,11 @@ class Pivots:
         inverse = ((self.graph.div(self.graph.one, entry),),)
         return Pivot((row,), (column,), inverse, entry if monitored is None else monitored)
 
-    # judgement at probes in the domain, and with angles over full turns where the system itself is regular
+    # quality at probes in the domain, and at probes with angles over full turns at which the system itself is
+    # regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Return whether an entry is far from zero wherever the system is regular, also outside the
-        domain.
-        """
+        """Return whether an entry is far from zero wherever the system is regular, also beyond the domain."""
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
         size = np.min(np.abs(ratio), initial=np.inf)
@@ -178,7 +179,7 @@ class Pivots:
         return bool(size > 0.25 or (size > GOOD and not ratio.min() < 0 < ratio.max()))
 
     def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
-        """Return a signed entry relative to the largest entry of its row."""
+        """Return an entry, with its sign, relative to the largest entry of its row."""
         r, c = place
         columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
         places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
@@ -187,8 +188,8 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """Return the probes, in the domain and far from it, at which the system with scaled rows and columns
-        is regular.
+        """Return at which probes, in the domain and far from it, the system with scaled rows and columns is
+        regular.
         """
         if self._kept_regular is None:
             count = len(self._given[0])
@@ -206,19 +207,19 @@ class Pivots:
         return self._kept_regular
 
     def _at(self, nodes) -> np.ndarray:
-        """Return values at the probes in the domain and the far ones."""
+        """Return values at the probes in the domain, followed by the far probes."""
         near = self.probes(nodes)
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
     def _size(self, row: int) -> np.ndarray:
-        """Return the size of the terms of a row at all probes."""
+        """Return the size of the terms that sum up to a row, at all probes."""
         if row not in self._sizes:
             self._sizes[row] = largest(self._at(self.A[row]), 0)
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
-        """Return reference sizes of the rows of some entries at the first `count` probes. Return None if the
-        system has no more rows than unknowns, since a vanishing row then makes it singular.
+        """Return reference sizes for the rows of some entries at the first `count` probes. Return None if the
+        system does not have more rows than unknowns, because a vanishing row then makes it singular.
         """
         if not self._tall:
             return None
@@ -227,8 +228,8 @@ class Pivots:
     # two rows and two columns
 
     def _best_pair(self) -> Pivot | None:
-        """Return the two rows and columns with the least fill-in whose determinant depends only on
-        parameters, or None.
+        """Return two rows and two columns whose determinant depends only on parameters, with the least
+        fill-in; None if there are none.
         """
         graph, A = self.graph, self.A
         used = {r: set(self._in_row(r)) for r in self.rows}
@@ -266,8 +267,8 @@ class Pivots:
     # combined rows
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """Combine all rows with an entry in a column into one pivot row, or take the entry at `single` if it
-        is as good.
+        """Return a pivot in a row that combines all rows with an entry in one column, or the entry at
+        `single` if it is at least as good.
         """
         graph, A, regular = self.graph, self.A, self._regular
         found = []
@@ -293,17 +294,17 @@ class Pivots:
         return (self._turned if two else self._orthogonal)(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
-        """Return weights for combining rows: one if their sizes are similar."""
+        """Return weights for combining rows: all one if their sizes are similar."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
-        # otherwise scale rows whose sizes differ more than eightfold
+        # rows are scaled if their sizes differ by more than a factor of eight
         if min(sizes) * 8.0 > largest:
             return [1.0] * len(rows)
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 
     def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Replace the rows r, s with entries a, b in column c by `w_r a r + w_s b s`, the pivot row, and
-        `b r - a s`, with weights w.
+        """Replace the rows r, s, which have entries a, b in column c, by the pivot row `w_r a r + w_s b s`,
+        with weights w, and by `b r - a s`.
         """
         graph, A, (r, s) = self.graph, self.A, users
         a, b = A[r][c], A[s][c]
@@ -323,7 +324,7 @@ class Pivots:
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
-        """Add a row that combines all rows with an entry in a column, and remove the entry from these
+        """Add a row that combines all rows with an entry in a column, and eliminate the entry from these rows
         (Gram-Schmidt).
         """
         graph, A = self.graph, self.A
@@ -356,8 +357,8 @@ class Pivots:
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
-    """Return the ratios of entries to the largest entry of their row, or to `sizes` if larger. Entries of a
-    row are contiguous.
+    """Return the ratios of entries to the largest entry of their row, or to `sizes` if these are larger.
+    Entries of a row are contiguous.
     """
     values = np.abs(values)
     # places are ordered by rows
@@ -375,7 +376,7 @@ def turns(graph: Graph, node: int) -> bool:
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:
-    """Return the smallest finite ratio; zero without any."""
+    """Return the smallest finite ratio; zero if there is none."""
     return float(np.min(ratio[np.isfinite(ratio)], initial=np.inf)) if np.isfinite(ratio).any() else 0.0
 
 

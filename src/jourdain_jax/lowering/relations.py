@@ -1,14 +1,15 @@
-"""Relations that decide between branches of rates and stop events. The sign of a number decides (`sides.py`):
+"""Find the relations that decide between branches of rates and events. Each relation is decided by the sign
+of a number (`sides.py`):
 
     relation    a < b, max(a, b), ...     sign(x), |x|     floor(x), ceil(x)     round(x)
     number      a - b                     x                sin(pi x)             sin(pi (x + 1/2))
 
-A relation counts if a rate or its slope differs between the two sides of the zero of its number. It also
-counts if a stop event may have a dip there. Relations on which this number depends then count as well.
-Relations with equal branches, as in guards, do not count. A relation without a zero between probes counts.
+A relation is monitored if a rate or its slope differs between the two sides of the zero of its number, if an
+event may have a dip there, or if its number has no zero between probes. Relations on which a monitored number
+depends are monitored, too. Relations with equal branches, as in guards, are not monitored.
 
-Both branches are evaluated on both sides of zeros between probes, for all decisions of unrelated relations:
-the branches of `(x > a) & (y > b)` agree where y < b.
+Both branches are evaluated on both sides of zeros between probes, for all decisions of unrelated relations,
+because, for example, the branches of `(x > a) & (y > b)` agree where y < b.
 
 A rate jumps at a zero if its change does not shrink with the distance between the two sides. Otherwise it has
 a kink.
@@ -22,21 +23,21 @@ from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList
 
-MOST_WATCHED = 32  # limit per scene
+MOST_WATCHED = 32  # maximum number of monitored relations of a scene
 # truth for a > b, and for a < b
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}
-EQUAL = {"eq": (False, False), "ne": (True, True)}  # numbers of these relations alone do not count
+EQUAL = {"eq": (False, False), "ne": (True, True)}  # not monitored, unless the number also decides others
 COMPARED |= EQUAL
-# distance from a zero, relative to the distance of two probes; tolerance relative to the size of a rate
+# distance from a zero, relative to the distance of two probes; tolerance, relative to the size of a rate
 ASIDE, AGREE = 1e-5, 1e-7
-DECISIONS = 512  # maximum number of decisions of other relations at each zero; of more, random ones are tried
-Decided = dict[int, list[tuple[int, int]]]  # as `switches` returns it
+DECISIONS = 512  # maximum number of decisions of other relations at each zero; if there are more, random ones
+Decided = dict[int, list[tuple[int, int]]]  # result of `switches`
 WHOLE = ("floor", "ceil", "round", "rem")
 
 
 def switches(graph: Graph, nodes: Iterable[int]) -> Decided:
-    """Return a dictionary: number whose sign decides -> its relations, each with a factor: 1, or -1 if the
-    negative number decides.
+    """Return relations by the number whose sign decides them. Each relation has a factor: 1, or -1 if the
+    negative number decides it.
     """
     found: Decided = {}
     for n in graph.reachable(list(nodes)):
@@ -67,7 +68,7 @@ def _own(graph: Graph, node: int) -> int | None:
 
 
 def counted(graph: Graph, op: str, args: Sequence[int]) -> int:
-    """Return the number whose integer part decides: a/b for rem(a, b), a + 1/2 for round(a), otherwise a."""
+    """Return the number whose integer part decides: a/b for rem(a, b), a + 1/2 for round(a), a otherwise."""
     if op == "rem":
         return graph.div(*args)
     return graph.add(args[0], graph.const(0.5)) if op == "round" else args[0]
@@ -97,7 +98,7 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
 
 
 def where(graph: Graph, condition: int, there: int, otherwise: int) -> int:
-    """Return a node with the value `there` if the condition is true, else `otherwise`."""
+    """Return a node with the value `there` if the condition is true, and `otherwise` if not."""
     return graph.call("select", condition, otherwise, there)
 
 
@@ -114,7 +115,7 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
 def relations(
     graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]
 ) -> tuple[Indices, Indices]:
-    """Return the numbers whose signs are monitored: numbers of the rates, and further numbers of stop events.
+    """Return the numbers whose signs are monitored: those of the rates, and further numbers of events.
 
     Numbers that depend on `modes` are omitted, because modes have their own events.
     """
@@ -134,7 +135,9 @@ def relations(
 
 
 def _counts(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], excess, probes) -> bool:
-    """Return whether the branches of the relations differ near a zero of their number."""
+    """Return whether a number must be monitored: the branches of its relations differ near a zero, or it has
+    none.
+    """
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
     for beside, here in _beside(graph, number, decided, outputs, probes):
         above, below = branches(graph, decided[number], here)
@@ -151,13 +154,15 @@ def _difference(values, above, below):
 
 
 def _dip(values, above, below):
-    """Return the excess of a value over the lower of its two branches; with an excess it may dip."""
+    """Return the excess of a value over the lower of its two branches. If there is an excess, the value may
+    dip.
+    """
     return values - np.minimum(above, below)
 
 
 def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
-    """Return the numbers whose branches continue beyond their zeros: both are finite wherever the outputs
-    are.
+    """Return the numbers whose branches are both defined beyond their zeros: both are finite wherever the
+    outputs are.
     """
     decided, finite = switches(graph, outputs), np.isfinite(probes(outputs))
 
@@ -169,7 +174,7 @@ def sided(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> Indices:
-    """Return the numbers at whose zeros, between probes, an output jumps."""
+    """Return the numbers at whose zeros between probes an output jumps."""
     outputs, decided = list(outputs), switches(graph, outputs)
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
 
@@ -185,8 +190,9 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
 
 
 def _beside(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], probes: Probes) -> Iterator:
-    """Yield a function from a distance to states before and behind zeros of a number, and the outputs. Then
-    yield the same for all decisions of unrelated relations. Yields nothing without a zero between probes.
+    """Yield a pair: a function from a distance to probes on the two sides of zeros of a number, and the
+    outputs. Then yield such a pair for all decisions of unrelated relations. Yield nothing if there is no
+    zero between probes.
 
     A relation is unrelated if neither number depends on the other, and its number varies between the zeros.
     """

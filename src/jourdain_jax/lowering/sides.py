@@ -1,5 +1,5 @@
-"""Relations of a scalar program as modes and events. A mode s is the side of a relation on which the state
-is.
+"""Convert relations of a scalar program, such as `a < b` or `|x|`, to modes and events. The mode s of a
+relation is the side of it on which the state is.
 
     x = a - b of a < b, max(a, b), ...; x of |x|, sign(x)     s = 1, -1: x counts as positive, negative
     c = s x falls through zero:  s <- -s                      s = 0: x rests at zero; its current sign counts
@@ -7,9 +7,9 @@ is.
     n of floor(a) = n, ceil(a) = n + 1, ...                   s = 2 n + 1; s = 0 before the start
     c = (a - n) (n + 1 - a) falls through zero:  n <- n +- 1
 
-No branch changes within a step: the event search ends the step where x vanishes, and the derivative jumps
-there as at any event (`integrate/loop/transitions.py`). Modelica treats relations in the same way. If a
-branch is undefined beyond x = 0, as with `sqrt`, its relation has only the event.
+The branch does not change within a step: the event search ends the step where x vanishes, and derivatives
+change there as at any event (`integrate/loop/transitions.py`). Modelica treats relations in the same way. If
+a branch is undefined beyond x = 0, as with `sqrt`, its relation has the event but not the mode.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ from jourdain_jax.structure.trace import Variables
 
 @lru_cache(maxsize=64)
 def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lowered:
-    """Return the program with one more mode and event for each relation, after the scene's modes and events.
+    """Return the program with a mode and an event for each relation, after the scene's modes and events.
 
     `modes`: indices of the inputs that are modes.
     """
@@ -58,7 +58,7 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     ]
     inputs = np.array([*(new[n] for n in program.traced.inputs.tolist()), *sides], np.int64)
     parts = program.traced.q, program.traced.u
-    # no dependent speeds
+    # nodes of dependent speeds do not exist on the new graph
     q, u = (np.array([new.get(n, 0) for n in part.tolist()], np.int64) for part in parts)
     now = [*q.tolist(), *(int(u[k]) for k in program.independent), *(int(inputs[i]) for i in modes)]
     events, stops = (copied["events"], program.stops) if has_events else ((), ())
@@ -66,7 +66,9 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     resets: list[int] = []
 
     def add(after: dict[int, int], rise: int) -> None:
-        """Add a reset: the state and the modes `after` an event, the sides there, and the gain in energy."""
+        """Add a reset: the state and the modes `after` an event, the new sides, and the gain of stored
+        energy.
+        """
         for k in sorted(range(len(x)), key=numbers.__getitem__):  # in order of dependence
             (moved,) = graph.substituted([x[k]], after)
             if moved != x[k] and sides[k] not in after:
@@ -103,8 +105,8 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
 
 
 def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, int]) -> int:
-    """Return the number a whose integer part decides. `first`: one of its relations, and -1 if -a decides
-    there.
+    """Return the number a whose integer part decides. `first`: one of its relations, and a factor: 1, or -1
+    if -a decides this relation.
     """
     node, turned = first
     found = counted(graph, old.op[node], [new[a] for a in old.args[node]])
@@ -112,17 +114,17 @@ def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, in
 
 
 def _whole(graph: Graph, side: int) -> int:
-    """Return n of the side 2 n + 1."""
+    """Return the integer n that belongs to the side 2 n + 1."""
     return graph.mul(graph.const(0.5), graph.sub(side, graph.one))
 
 
 def _odd(graph: Graph, n: int) -> int:
-    """Return the side 2 n + 1."""
+    """Return the side 2 n + 1 that belongs to the integer n."""
     return graph.add(graph.mul(graph.const(2.0), n), graph.one)
 
 
 def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, number: int, whole: bool) -> int:
-    """Return the value of a relation on this `side` of its number; `turned`: -1 if the negative number
+    """Return the value of a relation on this `side` of its number. `turned`: 1, or -1 if the negative number
     decides.
     """
     at_rest = graph.call("eq", side, graph.zero)

@@ -1,5 +1,5 @@
-"""The loop over steps on arrays of JAX, by the source in `integrate/loop`, where there is no machine code.
+"""Run the loop over steps (`integrate/loop`) on JAX arrays, if there is no machine code.
 
-`array_writer.py` renders the source; `array_loop.py` runs it, `array_adjoint.py` goes back over it. Change a
-step in `integrate/loop/step.py`, not here. Open `array_loop.py` first.
+`array_writer.py` evaluates the code of a step on arrays; `array_loop.py` is the loop, `array_adjoint.py` its
+reverse mode. To change a step, edit `integrate/loop/step.py`. Open `array_loop.py` first.
 """

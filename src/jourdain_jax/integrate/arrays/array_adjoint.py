@@ -1,9 +1,9 @@
-"""Reverse mode of the loop in JAX, by the source of machine code (`integrate/loop/adjoint.py`).
+"""Reverse mode of the loop in JAX, by the same code as machine code (`integrate/loop/adjoint.py`).
 
-The motion is integrated once more, and its trial steps are recorded in a window of limited length. Then the
-steps of each earlier window are computed again, with equal bits, from the nearest checkpoint: a stored state
-at the beginning of a window. The number of checkpoints is limited, too; at the limit, every second checkpoint
-is dropped.
+The motion is integrated once more, and its trial steps are recorded in a window of limited length. At the
+end, the window contains the last steps. The steps of each earlier window are computed again, with equal bits,
+from the nearest checkpoint, which is a state stored at the beginning of a window. The number of checkpoints
+is also limited; at the limit, every second checkpoint is dropped.
 """
 
 import math
@@ -27,14 +27,15 @@ from jourdain_jax.integrate.loop.record import Slot
 from jourdain_jax.integrate.loop.transitions import is_noted, reset_back
 
 SLOTS = (
-    # most trial steps per window, and most checkpoints; short memory reduces both, down to a sixteenth
+    # maximum number of trial steps per window and of checkpoints; a memory limit may reduce both, to a
+    # sixteenth
     256
 )
 
 
 class _Record(NamedTuple):
-    """Forward steps of a motion: their number, the window in memory, and
-    checkpoints at every `every` windows.
+    """Record of the forward steps of a motion: their number, the window in memory, and a checkpoint at every
+    `every`-th window.
     """
 
     going: Going
@@ -54,10 +55,11 @@ def cotangents(
     g_t: Array,
     g_log: Array,
 ) -> tuple[Array, list[Array]]:
-    """Return cotangents of the initial state, and of the known arrays with the indices `asked`.
+    """Return the cotangents of the initial state, and of the known arrays with the indices `asked`.
 
     `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and its time, and of
-    times of transitions. `memory`: bytes; the window and the checkpoints each take at most a quarter.
+    the times of transitions. `memory`: limit in bytes; the window and the checkpoints each use at most a
+    quarter.
     """
     form, slot = of.form, Slot.of(of.form, of.method)
     begun, fixed = of.begun(start)

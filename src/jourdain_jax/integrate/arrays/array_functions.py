@@ -1,8 +1,8 @@
-"""Rates, projection and stop events as JAX functions, which replace the scalar program of machine code.
+"""Rates, projection and events as JAX functions, in place of the scalar program that machine code uses.
 
-The source of a step differentiates the step; JAX differentiates only these functions. Tangents follow the
-state (`integrate/loop/form.py`) and the arrays shared by all steps. `pushed` returns the values of a function
-with all tangents, by nested `jvp`.
+The code of a step also computes its derivatives; JAX differentiates only these functions. The tangents of the
+state are stored after the state (`integrate/loop/form.py`), those of the arrays that all steps share after
+these arrays. `pushed` returns a function with all tangents, by nested `jvp`.
 """
 
 import math
@@ -27,7 +27,7 @@ from jourdain_jax.integrate.vector_fields.field import Integrated
 
 @dataclass(frozen=True)
 class ArrayForm(Form):
-    """Sizes of the integrated state without a scalar program."""
+    """Sizes of the integrated state if there is no scalar program."""
 
     program: None  # type: ignore[assignment]
     coordinates: int = 0  # type: ignore[assignment]
@@ -39,18 +39,18 @@ class ArrayForm(Form):
 
     @property
     def monitored(self) -> range:  # type: ignore[override]
-        """Return the indices of quantities monitored at all stages of a step, as for a program."""
+        """Return the indices of the quantities monitored at all stages of a step."""
         return range(self.pivots + self.turning + len(self.squares))
 
     @property
     def known(self) -> dict[str, int]:
-        """Return nothing: known values are arrays shared by all steps."""
+        """Return no rows: known values are arrays that all steps share."""
         return {}
 
 
 def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
-    """Return the values of `f` at the first part, then its tangents for the other
-    parts in order (None: zero).
+    """Return the value of `f` at the first of `parts`, then its tangents along the other parts, in order.
+    None in a part means zero.
     """
     if len(parts) == 1:
         return [f(*parts[0])]
@@ -74,11 +74,11 @@ def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
 
 @dataclass
 class Functions:
-    """Rates, projection, events and their cotangents on rows in memory, as a step calls them."""
+    """Functions that a step calls: rates, projection, events and their cotangents, on rows in memory."""
 
     w: ArrayWriter
     form: Form
-    rest: tuple  # arguments of rates without arrays
+    rest: tuple  # arguments of the rates, without their arrays
     shared: tuple[Sequence, ...]  # these arrays, then their tangents
     asked: tuple[int, ...]  # indices of arrays whose cotangents are requested
     method: Any
@@ -93,7 +93,7 @@ class Functions:
         self.modes = [self.w.load(state, row) for row in self.form.rows["mode"]]
 
     def in_step(self, t, h) -> None:
-        """Restrict the rates to this step, in which samples have one slope."""
+        """Evaluate the rates within this step, in which sampled inputs have one slope."""
         self.middle = t + 0.5 * h
 
     def _args(self, shared: Sequence, middle: Array | None = None) -> PyTree:
@@ -120,13 +120,13 @@ class Functions:
         return integrands.events(t, self._state(y), self._args(shared))
 
     def _solved(self, t, h, y, *shared) -> tuple:
-        """Return the end of an implicit step, its error estimate, and whether its equations were solved."""
+        """Return the state after an implicit step, its error estimate, and whether the step was solved."""
         before = self._state(y)
         found = self.method.solve(self._args(shared, self.middle), t, before, h)
         return jax.tree.map(jnp.add, before, found.change), found.error, found.solved
 
     def _parts(self, state: Pointer, t, y: Pointer) -> list[list]:
-        """Return time, the state in memory and the shared arrays, each with its tangents."""
+        """Return lists of time, state and shared arrays: the values, then the tangents of each direction."""
         times = [
             t,
             *(self.w.load(state, row) if self.form.time_moves else None for row in self.form.rows["dt"]),
@@ -145,7 +145,7 @@ class Functions:
     # counterparts of `integrate/loop/rate_functions.py` and `projection.py`
 
     def rates(self, state: Pointer, t, y: Pointer, k: Pointer, monitored: Pointer) -> None:
-        """Store the rates of the state, and the monitored numbers."""
+        """Store the rates of the state and the monitored quantities."""
         watching = Rows(0, len(self.form.monitored))
 
         def watched(t, y, *shared):
@@ -167,7 +167,7 @@ class Functions:
         self._store(pushed(self._projected, self._parts(state, t, y)), y, self.count)
 
     def along(self, state: Pointer, t, y: Pointer) -> None:
-        """Project an error, stored after its state, onto directions along the constraints."""
+        """Project an error, stored after its state, onto the directions that the constraints allow."""
         at, error = self.w.load(y, self.y), self.w.load(y, self.y + self.count)
         self.w.store(
             jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1],
@@ -176,7 +176,7 @@ class Functions:
         )
 
     def events(self, state: Pointer, t, y: Pointer, slope: Pointer, c: Pointer, rate: Pointer) -> None:
-        """Store values of stop events, and their rates along a slope of the state."""
+        """Store the values of events, and their rates if the state changes at the rate `slope`."""
         at, along = (t, self.w.load(y, self.y)), (jnp.ones_like(t), self.w.load(slope, self.y))
         for place, found in zip(
             (c, rate), jax.jvp(lambda t, y: self._events(t, y, *self.shared[0]), at, along), strict=True
@@ -184,7 +184,7 @@ class Functions:
             self._store([found], place, self.form.events)
 
     def event_tangents(self, state: Pointer, t, y: Pointer, dc: Pointer) -> None:
-        """Store the tangents of the values of stop events."""
+        """Store the tangents of the values of events."""
         self._store(pushed(self._events, self._parts(state, t, y))[1:], dc, self.form.events)
 
     # events after which the motion continues (`integrate/loop/transitions.py`)
@@ -199,7 +199,7 @@ class Functions:
     def _reset_at(
         self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]
     ) -> tuple[list, list]:
-        """Return the state after an event and the time of the event, both with their tangents.
+        """Return the state after an event and the time of the event, with their tangents.
 
         `parts`: the state and the varying arrays, with tangents; `fixed`: the other arrays, by index;
         `modes`: modes after the event.
@@ -234,7 +234,7 @@ class Functions:
         return after + [dy - rate * dt for dy, rate in zip(d_after, later, strict=True)], times + d_times
 
     def reset(self, state: Pointer, t, y: Pointer, event, after: Pointer) -> None:
-        """Store the state after an event, the modes, and the time of the event, with tangents."""
+        """Store the state after an event, the new modes, and the time of the event, with tangents."""
         of, parts = self.form.rows_of_transition, [part[1:] for part in self._parts(state, t, y)]
         modes = self._reset(event, t, *parts[0])[self.count :]
         moves = {0} | {k for part in parts[1:] for k, x in enumerate(part) if x is not None}
@@ -258,7 +258,7 @@ class Functions:
         self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer
     ) -> None:
         """Pull cotangents back from the state after an event to the state before it. In `to_known`, the
-        cotangent of the event's time follows those of the arrays.
+        cotangents of the arrays come first, then the cotangent of the event's time.
         """
         known = sum(self.sizes())
         of_state = lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
@@ -270,8 +270,8 @@ class Functions:
     # implicit methods
 
     def solve(self, state: Pointer, t, h, y1: Pointer, error: Pointer, told: Pointer) -> None:
-        """Take an implicit step; store its end, its error estimate if any, and
-        whether its equations were solved.
+        """Take an implicit step. Store the state after it, its error estimate (zero if the method has none),
+        and whether its equations were solved.
         """
 
         def f(t, y, *shared):
@@ -287,8 +287,8 @@ class Functions:
         self.w.store(solved, told)
 
     def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
-        """Project a state onto its constraints. Store the size of the change,
-        relative to the step, as `told[1]`.
+        """Project a state onto its constraints. Store the size of the change, relative to the change by the
+        step, in `told[1]`.
         """
         free = self.w.load(y, self.y)
         self.project(state, t, y)
@@ -302,11 +302,11 @@ class Functions:
             ratios.append(jnp.max(jnp.abs(after - given), initial=0.0) / change)
         self.w.store(jnp.max(jnp.stack(ratios)), told, 1)
 
-    # cotangents, of motions without tangents
+    # cotangents (of motions without tangents)
 
     def _pull(self, f: Callable, y: Pointer, g: Pointer, rows: int, to_y: Pointer, to_known: Pointer) -> None:
-        """Store the cotangent of the state, pulled back through `f`, and add cotangents of the
-        requested arrays to `to_known`.
+        """Pull the cotangents `g` back through `f`: store the cotangent of the state in `to_y`, and add those
+        of the requested arrays to `to_known`.
         """
 
         def of(y, asked):
@@ -353,11 +353,11 @@ class Functions:
     def pull_events(
         self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer
     ) -> None:
-        """Pull cotangents back through the values of stop events."""
+        """Pull cotangents back through the values of events."""
         self._pull(partial(self._events, t), y, g, self.form.events, to_y, to_known)
 
     def pull_step(self, state: Pointer, t, h, y: Pointer, g: Pointer, added: Pointer) -> None:
-        """Pull cotangents back through an implicit step and its projection, in lanes that took it."""
+        """Pull cotangents back through an implicit step and its projection, in lanes that took the step."""
 
         def f(y, *shared):
             end = self._solved(t, h, y, *shared)[0].rows

@@ -1,12 +1,12 @@
-"""The loop over steps in JAX: the source of a step (`integrate/loop/step.py`) with JAX functions.
+"""The loop over steps in JAX: the code of a step (`integrate/loop/step.py`), with JAX functions.
 
-The batch axis is the last one. In each pass of one loop all samples try a step, each towards its own next
-time; a sample that has ended stays unchanged. Tangents are integrated with the state, and JAX
-differentiates only the rates,
+The batch axis is last. In each pass of the loop all samples try a step, each towards its own next time; a
+sample that has ended does not change. Tangents are integrated together with the state, and JAX differentiates
+only the rates:
 
     (y, dy)' = (f(y, p), df/dy dy + df/dp dp)
 
-For higher derivatives, tangents of these numbers follow (`integrate/loop/form.py`).
+For higher derivatives, tangents of these values are added (`integrate/loop/form.py`).
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from jourdain_jax.integrate.loop.step import IDLE, step, tried_by_stages
 
 
 class Going(NamedTuple):
-    """A motion during integration."""
+    """Motion during integration."""
 
     y: Float[Array, "y *lanes"]  # with its tangents
     rows: dict[int, PerLane]  # other rows that steps change
@@ -40,15 +40,15 @@ class Going(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Step-by-step integration of a motion; a `Start` holds all arrays."""
+    """Loop over the steps of a motion, without arrays, which are in the `Start`."""
 
     form: Form
     method: Method | ImplicitMethod
-    rest: tuple  # arguments of rates without arrays
+    rest: tuple  # arguments of the rates, without their arrays
     most: int  # maximum number of steps
 
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
-        """Return the start, and the rows that steps do not change."""
+        """Return the motion at its start, and the rows that steps do not change."""
         t, form = start.goals[0], self.form
         given = {first + i: x for first, run in constant_rows(form).items() for i, x in enumerate(run)}
         later = [row for row in range(form.integrated, form.rows["mode"].stop) if row not in given]
@@ -66,7 +66,7 @@ class Loop(NamedTuple):
 
     @property
     def log(self) -> list[range]:
-        """Return the rows of transitions, grouped by kind."""
+        """Return the rows that record transitions, one range per recorded quantity."""
         names = [name for name in ("log_event", "log_mode", "log_lost", "log_t") if name in self.form.rows]
         most = max(self.form.transitions, 1)
         return [
@@ -94,7 +94,7 @@ class Loop(NamedTuple):
         return state
 
     def tried(self, going: Going, fixed: dict, start: Start) -> tuple[Going, Array]:
-        """Try a step in all running samples. Return also the rates at its stages."""
+        """Try a step in all running samples. Also return the rates at its stages."""
         w = self.writer(start)
         state, k = self.rows_in(w, going, fixed), w.room(self.form.integrated * self.method.needed)
         tried = tried_by_stages if isinstance(self.method, Method) else tried_by_equations
@@ -109,7 +109,7 @@ class Loop(NamedTuple):
         return self.form.rows[name].start
 
     def saving(self, start: Start, going: Going, ys: Array | None) -> tuple[Going, Array | None]:
-        """Count the times reached, save the states there (with `ys`), and set the next time."""
+        """Count the times reached, set the next one, and, unless `ys` is None, save the states there."""
         code_, t_, goal_ = map(self._row, ("code", "t", "goal"))
         times, y = len(start.goals), going.y
 
@@ -168,7 +168,7 @@ class Loop(NamedTuple):
 
 
 def at_number(x: Float[Array, "times *lanes"], i) -> PerLane:
-    """Return the time with index `i` for each sample."""
+    """Return for each sample the time with its index `i`."""
     return x[i] if x.ndim == 1 else jnp.take_along_axis(x, i[None], 0)[0]
 
 

@@ -1,6 +1,6 @@
 """The loop in JAX (`array_loop.py`) as a function with derivatives in forward and reverse mode.
 
-If the rates support batches, `vmap` runs blocks of samples.
+If the rates support batches, `vmap` of this function runs blocks of samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ from jourdain_jax.integrate.vector_fields.field import Integrated
 def loop_of(
     method: Method | ImplicitMethod, setup: Setup, begun: Begun, of_events: dict[str, Any]
 ) -> tuple[Loop, Start]:
-    """Return the loop, and the start of one motion. `of_events`: the events of the form."""
+    """Return the loop and the start of one motion. `of_events`: fields of the form that describe events."""
     goals, knots, field, y0 = setup.times.goals, setup.knots, setup.field, begun.y0
     args, most, eps = (integrands.within(goals[0], begun.args), setup.most_steps(knots), float(eps_of(y0.q)))
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))
@@ -62,7 +62,7 @@ def loop_of(
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """Return the motion as a function of its start; `at_once`: samples per block, 0 for all of `vmap`."""
+    """Return the motion as a function of its start. `at_once`: samples per block; 0: all together."""
     return differentiated(
         lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
     )
@@ -81,8 +81,8 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
 
 
 def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
-    """Return the reverse mode of `flow` as a function of the start and of cotangents,
-    by `cotangents` in `array_adjoint.py`.
+    """Return the reverse mode of `flow` as a function of the start and of the cotangents of the motion
+    (`array_adjoint.py`).
     """
     back = partial(cotangents, of, asked, memory)
     if not at_once:
@@ -102,7 +102,7 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """Run blocks of samples one after another. Outside of a block the batch axis is first; inside it is last,
+    """Run blocks of samples one after the other. The batch axis is first outside a block, and last inside it,
     except in known arrays.
     """
     given = jax.tree.map(
@@ -125,8 +125,8 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function (state, time t, shift d) -> state that shifts the state along its rates by d. The
-    value of d is zero: it only carries derivatives.
+    """Return a function of a state, its time t and a shift d, which shifts the state along its rates by d.
+    The value of d is zero: it only carries derivatives.
     """
     known, others = eqx.partition(args, eqx.is_inexact_array)
 

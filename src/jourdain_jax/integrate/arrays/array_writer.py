@@ -1,7 +1,7 @@
-"""Writer that evaluates the source of a step (`integrate/loop/step.py`) on JAX arrays.
+"""Writer that evaluates the code of a step (`integrate/loop/step.py`) on JAX arrays.
 
-The batch axis is the last one, stages are one loop, so that the rates are compiled once, and a branch is
-`lax.cond`. Each branch or loop is traced first to find the memory that it changes.
+The batch axis is last. Stages run in a loop, so that the rates are compiled once. A branch is a `lax.cond`.
+Each branch or loop is first traced to find the memory that it changes.
 """
 
 from collections.abc import Callable
@@ -17,19 +17,19 @@ from jaxtyping import Array
 
 
 class Rows(NamedTuple):
-    """Range of rows in place of a single row."""
+    """Range of rows, used in place of the index of a single row."""
 
     first: Any
     many: int
 
     def __add__(self, by) -> "Rows":
-        """Return the same number of rows, shifted."""
+        """Return the range shifted by `by` rows."""
         return Rows(self.first + by, self.many)
 
 
 @dataclass(eq=False)
 class Room:
-    """Memory whose rows are separate arrays or pairs (an array of several rows, the index in it)."""
+    """Memory whose rows are arrays, or pairs of an array of several rows and an index."""
 
     rows: list
     number: int  # serial number
@@ -43,7 +43,7 @@ class Pointer(NamedTuple):
 
 
 class ArrayWriter:
-    """Writer for JAX arrays. `functions`: the object whose methods `run` calls."""
+    """Writer for JAX arrays. `functions`: object whose methods `run` calls."""
 
     real, truth = "real", "truth"
     where, magnitude, larger, smaller, root = map(
@@ -69,7 +69,7 @@ class ArrayWriter:
         return a * b + c
 
     def run(self, function: str, *arguments) -> None:
-        """Call the function of this name, in the modes of the lanes."""
+        """Call the function with this name, in the current modes of the lanes."""
         self.functions.take_modes(arguments[0])
         getattr(self.functions, function)(*arguments)
 
@@ -79,11 +79,11 @@ class ArrayWriter:
         return Pointer(Room(rows, next(self._numbers)), 0)
 
     def room(self, rows: int = 1) -> Pointer:
-        """Return memory for some rows, initially zero."""
+        """Return memory for `rows` rows, initially zero."""
         return self._holding([jnp.zeros(self.lanes, self.dtype)] * rows)
 
     def holding(self, *parts: Array) -> Pointer:
-        """Return memory that holds the rows of several arrays."""
+        """Return memory that contains the rows of the given arrays."""
         return self._holding([(part, i) for part in parts for i in range(len(part))])
 
     def at(self, pointer: Pointer, index) -> Pointer:
@@ -97,7 +97,7 @@ class ArrayWriter:
         return pointer.first + index, 1
 
     def load(self, pointer: Pointer, index=0) -> Array:
-        """Return a row, or rows as one array."""
+        """Return a row, or a range of rows as one array."""
         first, count = self._place(pointer, index)
         if isinstance(first, jax.Array):
             found = jax.lax.dynamic_slice_in_dim(self.whole(pointer.room), first, count)
@@ -118,7 +118,7 @@ class ArrayWriter:
         return row[0][row[1]] if isinstance(row, tuple) else row
 
     def _of(self, rows: list) -> Array:
-        """Return rows as one array, joined from the longest available slices."""
+        """Return rows as one array, concatenated from slices that are as long as possible."""
         parts: list[tuple[Array, int, int]] = []
         for row in rows:
             array, i = row if isinstance(row, tuple) else (row[None], 0)
@@ -136,8 +136,8 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return the rooms (arrays in memory) that the function `body` writes, and the shapes of its results.
-        The trace leaves the rooms unchanged.
+        """Return the rooms to which the function `body` writes, and the shapes of its results. Their contents
+        stay unchanged.
         """
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)
@@ -147,7 +147,7 @@ class ArrayWriter:
         return [room for room in stored if room.number < newest], shapes
 
     def _within(self, rooms: list[Room], arrays: list[Array], body: Callable) -> tuple[list[Array], Any]:
-        """Return the memory after the body, and its result."""
+        """Run the body with `arrays` as contents of the rooms. Return the new contents, and the result."""
         for room, array in zip(rooms, arrays, strict=True):
             self._stored.setdefault(room, list(room.rows))
             room.rows = [(array, i) for i in range(len(array))]
@@ -165,7 +165,7 @@ class ArrayWriter:
         self._within(rooms, found, lambda: None)
 
     def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
-        """Return the result of applying the body to all stages in order."""
+        """Apply the body to all stages in order, and return its last result."""
         rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))
         found = jax.tree.map(
             lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes
@@ -193,21 +193,21 @@ class ArrayWriter:
         return False
 
     def intrinsic(self, name: str, a: Array) -> Array:
-        """Return the JAX counterpart of an LLVM function."""
+        """Apply the JAX counterpart of an LLVM function."""
         return getattr(jnp, name)(a)
 
     def at_first(self, i, first, otherwise):
-        """Return `first` in the first stage, otherwise the other."""
+        """Return `first` in the first stage and `otherwise` in all others."""
         return jnp.where(i == 0, first, otherwise)
 
     def table(self, numbers) -> Array:
-        """Return numbers that stages look up, integers as integers."""
+        """Return numbers as an array that stages can index. Integers stay integers."""
         found = np.asarray(numbers)
         return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
 
     def put_at(self, place: Pointer, rows: int, index: Array, value: Array, where: Array) -> None:
-        """Store a value in the row with each lane's own index, in lanes where `where` is true. Indices
-        beyond the last row are skipped.
+        """Store a value in the row `index`, which may differ between lanes, in the lanes selected by `where`.
+        An index beyond the last row has no effect.
         """
         every = Rows(0, rows)
         here = jnp.reshape(jnp.arange(rows), (-1, *[1] * len(self.lanes))) == index

@@ -1,8 +1,8 @@
-"""Step of an implicit method (`implicit_steps.py`) in JAX, under `vmap` for batches.
+"""Step of an implicit method (`implicit_steps.py`) in JAX. Batches run under `vmap`.
 
-Trial steps of the event search use the method, too. The last, tiny shifts of the search are steps of Tsit5,
-which carry the derivatives of the motion. A step whose equations are not solved has an infinite error.
-Methods with equal steps cannot repeat one: a rejection ends the motion with a result code.
+Trial steps of the event search use the method, too. The last, very small shifts of the search are steps of
+Tsit5, which carry the derivatives of the motion. If the equations of a step are not solved, its error is
+infinite. Methods with equal steps cannot repeat a step; a rejected step ends the motion with a result code.
 """
 
 import math
@@ -18,7 +18,7 @@ from jourdain_jax.integrate.loop.step import Trial, norm, project, seen, stages,
 
 
 def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
-    """Try a step; store rates at its start, middle and end in `k` if events or pivots need them."""
+    """Try a step. Store the rates at its start, middle and end in `k` if events or pivots need them."""
     reach, y = p["h"], p.pointer
     if method.even:
         reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
@@ -39,7 +39,7 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
     fault = w.where(solved, RUNNING * 1.0, float(result_codes.UNSOLVED_STEP))
     if form.projects and method.even:
         w.run("onto_rows", y, aim.t_1, y1, told)
-        # half of the change by the step
+        # the projection may change at most half of the change by the step
         fault = w.where(solved & (w.load(told, 1) > 0.5), float(result_codes.OFF_CONSTRAINTS), fault)
     elif form.projects:
         project(w, form, p, aim.t_1, y1, error)
@@ -53,8 +53,8 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
-    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its
-    sign or a constraint reversed.
+    """Return the smallest pivot at the ends and the middle of a step, and whether a pivot changed its sign or
+    a constraint reversed its direction.
     """
     at = w.room(form.integrated)
     pivots = w.room(max(len(form.monitored), 1))

@@ -1,9 +1,9 @@
-"""The loop over steps: one source for machine code (`lanes.py: MachineWriter`) and for arrays of JAX.
+"""The loop over steps. The same code writes machine code (`lanes.py: MachineWriter`) and runs on JAX arrays.
 
     step.py        a step, its error and its size        transitions.py  jumps of state and modes at events
-    adjoint.py     the way back over steps               record.py       the record that it reads
-    form.py        the rows of numbers in memory         loop.py         all steps of all samples
+    adjoint.py     reverse mode                          record.py       record of the steps for reverse mode
+    form.py        layout of the memory                  loop.py         all steps of all samples
 
-A lane holds one sample of a batch while it is integrated. Open `step.py` first, then `loop.py`;
-`native_motion.py` calls the result.
+A lane is the place of a vector register or an array in which one sample of a batch is integrated. Open
+`step.py` first, then `loop.py`; `native_motion.py` calls the loop.
 """

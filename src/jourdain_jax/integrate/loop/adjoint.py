@@ -1,21 +1,22 @@
 """Reverse mode of the loop over steps: cotangents of the start from the cotangents of the states and the end.
 
-All lanes of a block begin and end together here. On the forward pass every trial step leaves a slot
+Here, all lanes of a block begin and end together. In the forward pass, every trial step is recorded in a slot
 (`record.py`): the state before the step, the slopes of its stages, its length, and the number of times saved
-before. The length is zero if the step was rejected or the lane had ended. On the backward pass, with a fixed
-step size,
+before. The length is zero if the step was rejected or the lane had ended. In the backward pass, the length is
+treated as constant:
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l
     (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum_i G_i
 
-k_j: slopes of the stages; g_1, g_0: cotangents of the state after and before the step; g_p: of the known
-numbers p. A motion that ended at a stop event first goes back over the event (`event_adjoint.py`).
+k_j: slopes of the stages; g_1, g_0: cotangents of the state after and before the step; g_p: cotangent of the
+known numbers p. If the motion ended at a stop event, the backward pass begins with the event
+(`event_adjoint.py`).
 
-In JAX the same source goes back (`integrate/arrays/array_adjoint.py`). JAX differentiates this once more, by
-cotangents of the motion with a tangent. Let S be the sum of all states times their cotangents g, and let g'
-be the change of g along a tangent. The result is dS/dx, where x is the initial state and the known numbers.
-Its change is d(dS)/dx, where dS is the sum of states times g' and of their tangents times g: the cotangents
-are g' for the states and g for their tangents.
+The same code computes reverse mode in JAX (`integrate/arrays/array_adjoint.py`). The derivative of the
+cotangents along a tangent consists of cotangents of the motion with that tangent: let S be the sum of all
+states times their cotangents g, and let g' be the change of g along the tangent. Reverse mode returns dS/dx,
+where x is the initial state and the known numbers. Its change is d(dS)/dx, where dS is the sum of states
+times g' and of their tangents times g. So the cotangents are g' for the states and g for their tangents.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,8 +58,8 @@ from jourdain_jax.kernels.ffi import of_lane, write_handler
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
-    """Write the module; `asked`: indices of the numbers whose cotangents are needed; `memory`: bytes
-    for the records of all threads.
+    """Write the module of reverse mode. `asked`: indices of the numbers whose cotangents are needed;
+    `memory`: bytes for the records of all threads.
     """
     write_functions(w, form, method)
     write_pulled(w, form, asked)
@@ -86,15 +87,15 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
-    """Write `begin(job, state, who, lane)`: begin, in a lane, the sample with this index in the batch."""
+    """Write `begin(job, state, who, lane)`, which begins in a lane the sample whose index `who` states."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = w.load(who, lane, "i64")
         begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
 
 
 def _write_note(w: MachineWriter, form: Form) -> None:
-    """Write `note(job, state, who, saved)`: count the times reached, set the next one, and end
-    lanes that have reached all.
+    """Write `note(job, state, who, saved)`, which counts the times reached, sets the next one, and ends lanes
+    that have reached all.
     """
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form, state)
@@ -127,8 +128,8 @@ def _write_note(w: MachineWriter, form: Form) -> None:
 
 
 def _write_added(w: MachineWriter, form: Form) -> None:
-    """Write `added(job, who, first, end, g)`: add the cotangents of the states saved at the times with
-    indices `first` to `end - 1`.
+    """Write `added(job, who, first, end, g)`, which adds to `g` the cotangents of the states saved at the
+    times with indices `first` to `end - 1`.
     """
     count = form.integrated
     with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
@@ -149,15 +150,15 @@ def _write_added(w: MachineWriter, form: Form) -> None:
 
 
 def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """Write `step_back(state, here, g, by_known)`: go back over the step in the slot `here`,
-    in lanes that advanced in it.
+    """Write `step_back(state, here, g, by_known)`, which pulls cotangents back through the step in the slot
+    `here`, in lanes that advanced in it.
     """
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         step_back(w, form, method, asked, state, here, g, by_known)
 
 
 def _used(method: Method) -> list[int]:
-    """Return the stages on which the end of a step depends, the last one first."""
+    """Return the stages on which the end of a step depends, the last stage first."""
     found: list[int] = []
     for stage in reversed(range(method.needed)):
         if method.b[stage] != 0 or any(method.A[j][stage] != 0 for j in found):
@@ -175,7 +176,7 @@ def step_back(
     g: Number,
     by_known: Number,
 ) -> None:
-    """Go back over the step in the slot `here`, in lanes that advanced in it."""
+    """Pull cotangents back through the step in the slot `here`, in lanes that advanced in it."""
     slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
     h, t = w.load(here, slot.taken), w.load(here, slot.t)
     took, k = w.differs(h, 0.0), w.at(here, slot.y)
@@ -244,8 +245,8 @@ def step_back(
 
 
 def _write_project_back(w: MachineWriter, form: Form) -> None:
-    """Write `project_back(state, t, free, g, added)`: turn cotangents of a projected state into cotangents of
-    the state `free` before the projection.
+    """Write `project_back(state, t, free, g, added)`, which pulls cotangents of a projected state back to the
+    state `free` before the projection.
     """
     moves, count = form.moves, form.integrated
     with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
@@ -261,11 +262,11 @@ def _write_project_back(w: MachineWriter, form: Form) -> None:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Callable:
-    """Return reverse mode as a function of samples, of the rows of a start, of cotangents of the states at
-    the goals and of the end, with its time last, of the goals, and of the number of trial steps.
+    """Return a function that computes cotangents of the initial state and of the requested known numbers
+    (`asked`).
 
-    It returns cotangents of the initial state, and of the requested numbers among the known ones (`asked`). A
-    state is followed by its tangent.
+    Its arguments are: samples; the rows of a start; cotangents of the states at the goals, and of the end
+    with its time last; the goals; the number of trial steps. Each state is followed by its tangent.
     """
     count = form.integrated + len(asked)
     run_rows = called(
@@ -281,9 +282,9 @@ def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Call
 def flow_back(
     form: Form, method: Method, asked: Indices, memory: int
 ) -> Callable[..., Float[Array, "found"]]:
-    """Return a function that returns cotangents of the start's state and of the requested known numbers
-    (`asked`). Its arguments are the start, cotangents of the states at the goals, of the end and of the end's
-    time, and the number of trial steps.
+    """Return a function that computes cotangents of the start's state and of the requested known numbers
+    (`asked`), and that can itself be differentiated. Its arguments are the start, the cotangents of the
+    states at the goals, the cotangents of the end and its time, and the number of trial steps.
     """
     n = form.y
 
@@ -296,7 +297,7 @@ def flow_back(
         (start, g, ends, tries), (along, dg, dends, _) = primals, tangents
         dg, dends = filled(dg), filled(dends)
         raised, more = with_tangents(form, start, along)
-        # of the state and its tangent, at the goals, at the end, and of its time
+        # cotangents of each quantity and its tangent: the final state, its time, and the times of transitions
         parts = [x for a, b in pairwise((0, n, n + 1, len(ends))) for x in (dends[a:b], ends[a:b])]
         both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
         # events need the slopes of samples

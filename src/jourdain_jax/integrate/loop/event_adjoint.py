@@ -1,10 +1,11 @@
-"""Reverse mode of events: cotangents at the time and state of an event from cotangents at a fixed time.
+"""Reverse mode of events: convert cotangents at the time and state of an event to cotangents at a fixed time.
 
-If a motion ends at a stop event, at the time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, then
+A motion that ends at a stop event has the end time t_e = t - c(t, y)/cdot and the final state y - f c/cdot.
+Hence
 
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
-c: value of the event; f: rates; g: cotangents. Transitions follow in `transitions.py: reset_back`.
+c: value of the event; f: rates; g: cotangents. For transitions see `transitions.py: reset_back`.
 """
 
 import math
@@ -22,8 +23,8 @@ from jourdain_jax.kernels.ir_value import Value
 
 
 def write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `event_back(job, state, who, g, by_known)`, which calls the Python function `event_back` with
-    cotangents of the end's time from the job.
+    """Write the function `event_back(job, state, who, g, by_known)` of machine code. It takes the cotangents
+    of the end time from the job.
     """
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         located = is_located(w, Lanes(w, form, state))
@@ -37,8 +38,8 @@ def write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
 
 
 def write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
-    """Write `reset_back(job, state, who, left, g, by_known)`, which calls the Python function `reset_back`
-    with cotangents of the transition's time from the job.
+    """Write the function `reset_back(job, state, who, left, g, by_known)` of machine code. It takes the
+    cotangents of the transition's time from the job.
     """
     with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
         lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
@@ -78,13 +79,13 @@ def event_back(
     g: Number,
     by_known: Number,
 ) -> None:
-    """Turn cotangents of a state at a fixed time into cotangents at the time and state of an event."""
+    """Convert cotangents of the state and time of an event to cotangents of the state at a fixed time."""
     lanes, count = Lanes(w, form, state), form.integrated
     f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
     values, rates, weights = (w.room(form.events) for _ in range(3))
     t = lanes["t"]
     w.run("rates", state, t, state, f, pivots)
-    if form.moving:  # the tangent and its rates at a fixed time
+    if form.moving:  # compute the tangent and its rates at a fixed time
         dy, dt = w.at(state, form.y), lanes["dt"]
         each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(w.differs(dt, 0.0), dt * w.load(f, i), 0.0))
         lanes["dt"] = w.number(0.0)
@@ -114,8 +115,8 @@ def event_back(
 def _moved_back(
     w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int
 ) -> Number:
-    """Return the time derivative of an event's contribution to a tangent. It changes the cotangents `g` of
-    the state and adds to the others.
+    """Pull cotangents back through the effect of an event on a tangent: update the cotangents `g` of the
+    state, and add to those of the known numbers. Return the derivative with respect to time.
     """
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated

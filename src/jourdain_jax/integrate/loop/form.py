@@ -1,21 +1,22 @@
-"""Memory layout of lanes: a lane is a column, each number is a row, and a row is one vector for all lanes.
+"""Memory layout of the loop: a lane is a column, each number is a row, and a row is one vector for all lanes.
 
 A sample enters with the rows of `Form.given`, which include its initial progress, and leaves with the rows of
-its final progress. Tangents of the state follow the state, tangents of the rates' known numbers follow these
-numbers; `dt` are tangents of time, which only an event's time has. Derivatives of order n in directions e_1
-to e_n have 2^n - 1 tangents, indexed by the binary numbers of their subsets of directions: for second order,
-tangents along e_1, along e_2, and along both. `taken` is the advance by the last step. For Taylor series,
-`before` is the start time of the step, and `bound` limits the next one after a rejection.
+its final progress. Tangents of the state are stored after the state, those of the rates' known numbers after
+these numbers. `dt` are tangents of time, which only the time of an event has. Derivatives of order n in
+directions e_1 to e_n have 2^n - 1 tangents, one per subset of the directions, indexed by the binary number of
+the subset. For second order, these are the tangents along e_1, along e_2, and along both. `taken` is the
+advance by the last step. For Taylor series, `before` is the start time of the step, and `bound` limits the
+next step after a rejection.
 
-For sampled inputs (`samples.py`), `table` points to a lane's samples, `samples` is their number per input,
-and `knot` points to the next knot, at which a step must end.
+For sampled inputs (`samples.py`), `table` points to the samples of a lane, `samples` is their number per
+input, and `knot` points to the next knot, at which a step must end.
 
 If the motion continues after events (`transitions.py`), `mode` are the modes, and `passed` counts the
-transitions. `log_event`, `log_mode`, `log_lost` and `log_t` record, for each transition, the event, the new
+transitions. For each transition, `log_event`, `log_mode`, `log_lost` and `log_t` record the event, the new
 modes, the loss of energy, and the time with its tangents. `begun` is the number of steps accepted up to the
-last transition, `disarmed` marks events whose value has not yet left zero. `left` describes the transition in
-the last trial step: the event's index plus 1 (negative if its value has no slope), or 0 for none; its time;
-the state and modes before it.
+last transition. `disarmed` marks events whose value has not left zero since they happened. `left` describes
+the transition in the last trial step: the index of the event plus 1 (negative if its value has zero slope),
+or 0 if there was none; its time; the state and the modes before it.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max
 
 @dataclass(frozen=True)
 class Form:
-    """Integrated form: a lowered scene with its options for work, projection, events and monitored pivots."""
+    """Options that determine the loop and its memory: scalar program, work, projection, events, monitored
+    pivots.
+    """
 
     program: Lowered
     with_work: bool
@@ -39,7 +42,7 @@ class Form:
     affine: bool
     has_events: bool
     pivots: int  # number of monitored pivots
-    moving: tuple[Indices, ...] = ()  # for every tangent, the indices of known numbers that have it
+    moving: tuple[Indices, ...] = ()  # for each tangent, the indices of the known numbers that have it
     sampled: Indices = ()  # indices of sampled inputs
     time_moves: bool = False  # whether time has tangents
     compensated: bool = False  # whether the state uses compensated summation, as in single precision
@@ -47,7 +50,8 @@ class Form:
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
     most: int = 0  # maximum number of transitions of a motion
     stopping: bool = True  # whether events that end a motion are active
-    sides: tuple[bool, ...] = ()  # of relations, the last modes and events: whether each has integer sides
+    # whether each relation has integer sides (`floor`, `ceil`); relations are the last modes and events
+    sides: tuple[bool, ...] = ()
 
     @property
     def rates(self) -> list[int]:
@@ -67,8 +71,8 @@ class Form:
 
     @property
     def monitored(self) -> list[int]:
-        """Return the quantities monitored at all stages of a step: pivots, directions of constraints, then
-        distances from a loss of rank.
+        """Return the nodes monitored at all stages of a step: pivots, directions of constraints, then
+        distances from a loss of rank (`squares`).
         """
         return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
 
@@ -79,12 +83,12 @@ class Form:
 
     @property
     def turning(self) -> int:
-        """Return the total number of entries in directions of constraints."""
+        """Return the total number of entries of the directions of constraints."""
         return len(self.program.directions)
 
     @property
     def known(self) -> dict[str, int]:
-        """Return the row counts of known numbers (except time and state) and of their tangents."""
+        """Return the numbers of rows for known numbers (except time and state) and for their tangents."""
         return {
             "known": len(self.program.fixed) + len(self.program.inputs),
             "dknown": sum(map(len, self.moving)),
@@ -92,12 +96,14 @@ class Form:
 
     @property
     def squares(self) -> Indices:
-        """Return, for each constraint, its squared part normal to the earlier ones, then its squared size."""
+        """Return two nodes for each constraint: its squared component normal to the earlier constraints, and
+        its squared size.
+        """
         return self.program.squares if self.projects else ()
 
     @property
     def moves(self) -> list[int]:
-        """Return the sequence of projection steps, 1 for coordinates and 0 for speeds."""
+        """Return the sequence of projection steps: 1 for coordinates, 0 for speeds."""
         return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
 
     @property
@@ -134,15 +140,13 @@ class Form:
 
     @property
     def transitions(self) -> int:
-        """Return the maximum number of recorded transitions; zero if all of the
-        scene's events end the motion.
-        """
+        """Return the maximum number of recorded transitions; zero if all events of the scene are final."""
         return self.most if self.goes_on and not all(self.stops[: self.stated]) else 0
 
     @property
     def rows_of_transition(self) -> dict[str, range]:
-        """Return the results of a transition: the state after it, modes, the loss of energy,
-        and its time with its tangents.
+        """Return the rows of the results of a transition: the state after it, the modes, the loss of energy,
+        and the time with its tangents.
         """
         counts = {"y": self.integrated, "mode": len(self.switched), "lost": 1, "t": 1 + len(self.moving)}
         return _in_a_row(counts)
@@ -169,8 +173,8 @@ class Form:
 
     @property
     def ends(self) -> int:
-        """Return the number of cotangents of the end: final state, its time, times of
-        transitions, and their tangents.
+        """Return the number of cotangents of the end: final state, its time, times of transitions, and the
+        tangents of all these.
         """
         return (self.y + 1 + self.transitions) * (1 + len(self.moving))
 
@@ -182,7 +186,7 @@ class Form:
 
     @property
     def rows(self) -> dict[str, range]:
-        """Return name -> rows."""
+        """Return the rows of each quantity, by name."""
         search = {
             "search_t": 3,
             "search_c": 3 * self.events,

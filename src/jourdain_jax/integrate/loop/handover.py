@@ -15,7 +15,7 @@ Numbers = tuple[PerLane, ...]  # one number per row
 
 
 def constant_rows(form: Form) -> dict[int, tuple[float, ...]]:
-    """Return the rows that are equal at the start of every motion: index of the first -> values."""
+    """Return the rows that are equal at the start of every motion: values by the index of the first row."""
     rows, begun = form.rows, [0.0] * form.returned
     for name, x in (("code", float(RUNNING)), ("event", -1.0), ("pivot", math.inf)):
         begun[rows[name].start] = x
@@ -24,21 +24,23 @@ def constant_rows(form: Form) -> dict[int, tuple[float, ...]]:
 
 
 class Start(NamedTuple):
-    """Input of a loop: one motion. Tangents follow the state and the known numbers (`Form`)."""
+    """Input of the loop for one motion. The state and the known numbers are followed by their tangents
+    (`Form`).
+    """
 
     of_samples: tuple[Array, ...]  # tables and knots (`samples.py`); for a loop in JAX, only the knots
-    control: Numbers  # rtol, atol, shortest, longest and first step, most steps
-    goals: Float[Array, "times *lanes"]  # since the start
+    control: Numbers  # rtol, atol, shortest, longest and first step, maximum number of steps
+    goals: Float[Array, "times *lanes"]  # measured from the start
     origin: PerLane  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
-    # numbers; for a loop in JAX, the stored arguments of rates, batch axis first
+    # known numbers; for a loop in JAX, the arrays among the arguments of the rates, with the batch axis first
     known: tuple[tuple[Array, ...], ...]
     modes: Numbers = ()
-    plain: tuple[Array, ...] = ()  # `known` without batch axis where shared
+    plain: tuple[Array, ...] = ()  # `known`; arrays that all samples share have no batch axis
 
     def numbers(self) -> Numbers:
-        """Return the rows at the start after the state, except `constant_rows`. Rows shared by
-        all lanes have no batch axis.
+        """Return the rows after the state at the start, except `constant_rows`. Rows that all lanes share
+        have no batch axis.
         """
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
@@ -51,14 +53,14 @@ class Start(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Output of a loop: a motion. Tangents follow each part."""
+    """Output of the loop: a motion. Each part is followed by its tangents."""
 
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
-    t: Numbers  # of the end, since the start
+    t: Numbers  # time of the end, measured from the start
     log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
-    # rows of the progress after its time, the number of goals reached in order, then the number,
-    # events, energy losses and modes of transitions
+    # rows of the progress except its time; the number of goals reached; then the number, the events, the
+    # energy losses and the modes of transitions
     rest: Float[Array, "rest *lanes"]
 
     @staticmethod
@@ -68,7 +70,7 @@ class Found(NamedTuple):
         end: Float[Array, "returned *lanes"],
         count: Float[Array, "one *lanes"],
     ) -> "Found":
-        """Build a motion from its states, its rows at the end, and the number of goals reached."""
+        """Return a motion from its states at the goals, its final rows, and the number of goals reached."""
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
 
@@ -90,11 +92,11 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Remove the batch axis from results of `vmap` that do not need it. Also return a flag for each part:
-        whether it keeps the axis. `given`: the same flags of the start's parts.
+        """Remove the batch axis from those results of `vmap` that do not need it. Also return for each part
+        whether it keeps the axis. `given`: for each part of the start, whether it has the axis.
 
-        A tangent has a batch axis if anything on which it depends has one. All directions
-        share the values of one motion.
+        A tangent has a batch axis if any quantity on which it depends has one. If only directions are
+        batched, they share the values of one motion.
         """
         parts = range(len(self.y))
         base = any(jax.tree.leaves(given._replace(y=(), known=())))

@@ -1,6 +1,6 @@
-"""Lanes in memory, and the writer that turns the source of a step into machine code on them.
+"""Lanes in memory, and the writer that translates the code of a step to machine code on lanes.
 
-A lane holds one sample of a batch while it is integrated; `form.py` has the layout.
+One sample of a batch is integrated in each lane; `form.py` describes the memory layout.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,22 +16,22 @@ StepWriter = Any  # `MachineWriter`, or `ArrayWriter` for JAX arrays
 
 
 class MachineWriter(Writer):
-    """Translator of the source of a step to machine code.
+    """Writer that translates the code of a step to machine code.
 
-    Besides arithmetic and memory, the source uses the following operations. They are methods, so that a
-    writer may implement them differently:
+    Besides arithmetic and memory access, the code of a step uses operations that each writer implements in
+    its own way:
 
         if_any(c, body)            run the body if c holds in any lane; the body selects lanes by `where`
-        over_stages(n, body, x)    x <- body(i, x)
-        each(rows, body)           run the body for every row, independently
+        over_stages(n, body, x)    x <- body(i, x) for all stages i
+        each(rows, body)           run the body for each row, independently
 
-    `common`: rows of a start that all lanes of a GPU share, which are stored once.
+    `common`: for each row of a start, whether all lanes of a GPU share it; shared rows are stored once.
     """
 
     common: Sequence[bool] = ()
 
     def constant(self, pointer: Value, index: int) -> Value:
-        """Return a number shared by all threads of a GPU, from memory that is constant during the kernel."""
+        """Load a number that all threads of a GPU share, from memory that is constant during the kernel."""
         place = self.converted("addrspacecast", self.at(pointer, index), "ptr addrspace(1)").name
         text = f"load {self.real}, ptr addrspace(1) {place}, align 8, !invariant.load !{{}}"
         return self.instruction(self.real, text)
@@ -41,34 +41,34 @@ class MachineWriter(Writer):
         return power(self, x, exponent)
 
     def if_any(self, condition: Value, body: Callable[[], object]) -> None:
-        """Run the body's code if the condition holds in any lane."""
+        """Run the body if the condition holds in any lane."""
         with self.when(self.any(condition)):
             body()
 
     def over_stages(self, count: int, body: Callable[[int, Any], Any], found: Any) -> Any:
-        """Return the result of applying the body to all stages in order."""
+        """Apply the body to all stages in order, and return its last result."""
         for i in range(count):
             found = body(i, found)
         return found
 
     def in_step(self, t: Value, h: Value) -> None:
-        """Begin the stages of a step; nothing to do here, because samples depend only on time."""
+        """Begin the stages of a step. Machine code does nothing here, because samples depend only on time."""
 
     def is_first(self, i: int) -> bool:
         """Return whether this is known to be the first stage."""
         return i == 0
 
     def at_first(self, i: int, first: Any, otherwise: Any) -> Any:
-        """Return `first` in the first stage, otherwise the other."""
+        """Return `first` in the first stage and `otherwise` in all others."""
         return first if i == 0 else otherwise
 
     def table(self, numbers: Any) -> Any:
-        """Return numbers that stages look up."""
+        """Return numbers as a table that stages can index."""
         return numbers
 
     def put_at(self, place: Value, rows: int, index: Value, value: Value, where: Value) -> None:
-        """Store a value in the row with each lane's own index, in lanes where `where` is true. Indices
-        beyond the last row are skipped.
+        """Store a value in the row `index`, which may differ between lanes, in the lanes selected by `where`.
+        An index beyond the last row has no effect.
         """
         values, indices = self.room(), self.room()
         self.store(value, values)
@@ -85,7 +85,7 @@ class MachineWriter(Writer):
 
     def each(self, rows: range, body: Callable[[Any], object]) -> None:
         """Call the body with the index of every row."""
-        # above 12 rows use a loop, whose code is short
+        # for more than 12 rows use a loop, whose code is shorter
         if len(rows) <= 12:
             for i in rows:
                 body(i)
@@ -109,50 +109,50 @@ class MachineWriter(Writer):
 
 
 class Lanes:
-    """Rows of all lanes, in memory at `pointer`."""
+    """Rows of all lanes, at `pointer` in memory."""
 
     def __init__(self, w: StepWriter, form: Form, pointer: Number) -> None:
         self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
 
     def __getitem__(self, name: str) -> Number:
-        """Return the first row of this name."""
+        """Return the first row with this name."""
         return self.w.load(self.pointer, self.rows[name].start)
 
     def __setitem__(self, name: str, value: Number) -> None:
-        """Set the first row of this name."""
+        """Set the first row with this name."""
         self.w.store(value, self.pointer, self.rows[name].start)
 
     def every(self, name: str) -> list[Number]:
-        """Return the vectors of all rows of this name."""
+        """Return the vectors of all rows with this name."""
         return [self.w.load(self.pointer, row) for row in self.rows[name]]
 
     def put(self, name: str, values: Sequence[Number]) -> None:
-        """Set all rows of this name."""
+        """Set all rows with this name."""
         for row, value in zip(self.rows[name], values, strict=True):
             self.w.store(value, self.pointer, row)
 
     def place(self, name: str, lane: Number) -> Number:
-        """Return a pointer to the number of one lane."""
+        """Return a pointer to the number of one lane in the first row with this name."""
         return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
     def of(self, name: str, lane: Number, type: str = "double") -> Number:
-        """Return the number of one lane."""
+        """Return the number of one lane in the first row with this name."""
         return self.w.load(self.place(name, lane), type=type)
 
     def set(self, name: str, lane: Number, value) -> None:
-        """Set the number of one lane."""
+        """Set the number of one lane in the first row with this name."""
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
 def each_row(
     w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]
 ) -> None:
-    """Set these rows of a state in memory, or the first `rows`."""
+    """Store `value(i)` in each row i of `into`. `rows`: the rows, or the number of first rows."""
     w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
 def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
-    """Copy the first `rows` rows from another place, in lanes where `where` holds."""
+    """Copy the first `rows` rows of `source` to `into`, in the lanes selected by `where` (None: all)."""
     each_row(
         w,
         rows,
@@ -162,9 +162,9 @@ def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number
 
 
 def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
-    """Return the vectors of all rows of this name, which steps do not change.
+    """Return the vectors of all rows with this name, which steps do not change.
 
-    On a GPU, rows that all lanes share are read from the operand.
+    On a GPU, rows that all lanes share are read from the operand of the kernel.
     """
     rows = lanes.rows[name]
     if not any(w.common[row] for row in rows if w.device):
@@ -177,17 +177,17 @@ def stated(w: MachineWriter, lanes: Lanes, name: str) -> list[Value]:
 
 
 def room_of_lanes(w: MachineWriter, form: Form) -> Value:
-    """Return memory for all rows. On a GPU, a pointer to the shared rows follows them."""
+    """Return memory for all rows, on a GPU followed by a pointer to the shared rows."""
     return w.room(form.all + w.device)
 
 
 def arguments_of_samples(form: Form) -> int:
-    """Return the number of arguments of a handler that are samples."""
+    """Return the number of arguments of a kernel that belong to sampled inputs."""
     return 2 if form.sampled else 0
 
 
 def set_goal(w: MachineWriter, lanes: Lanes, lane: Value, goal: Value) -> None:
-    """Set the next time of a lane: the goal, or the next knot if that comes first."""
+    """Set the next time of a lane: the goal, or the next knot if the knot comes first."""
     if lanes.form.sampled:
         knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
         goal = w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)

@@ -1,10 +1,10 @@
-"""The loop over steps in machine code: from starts and times to save, to states and ends.
+"""The loop over steps in machine code.
 
-Lanes run in several threads, in the widest registers. When a sample has ended, the next one takes its lane. A
-single motion runs in narrow registers, whose instructions are faster. Results do not depend on the width. A
-call takes two arrays with one row per sample: the rows of `Form.given`, and the times to save. It returns the
-states at these times, and the rows of the final progress with the number of times reached in order. Tables
-and knots of sampled inputs come first (`samples.py`).
+Samples run in the lanes of the widest registers, in several threads. When a sample has ended, the next sample
+begins in its lane. A single motion runs in narrow registers, whose instructions are faster; results do not
+depend on the width. A call has two arguments with one row per sample: the rows of `Form.given`, and the times
+to save. It returns the states at these times, and the rows of the final progress with the number of times
+reached. If inputs are sampled, their tables and knots are the first arguments (`samples.py`).
 """
 
 import math
@@ -46,16 +46,17 @@ from jourdain_jax.kernels.ffi import (
 )
 from jourdain_jax.kernels.ir_value import Value
 
-# Words of a job, shared by all threads: number of samples, number of times, index of the next sample; on a
-# GPU the pointer to the record of steps, its slots of each thread, the pointer to the shared rows, and the
-# number of rows of times (one, or one per sample); words of samples, then pointers to the arrays
+# Words of a job, which all threads share: number of samples, number of times, index of the next sample; on a
+# GPU also the pointer to the record of steps, its number of slots per thread, the pointer to the shared rows,
+# and the number of rows of times (one, or one per sample); then the words of samples, and pointers to the
+# arrays
 COUNT, TIMES, NEXT, RECORD, SLOTS, COMMON, ROWS_OF_TIMES, FIRST_OF_SAMPLES = range(8)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
 def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write the module."""
+    """Write the module of the loop."""
     write_functions(w, form, method)
     _write_begin(w, form)
     _write_serve(w, form)
@@ -85,8 +86,8 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
 
 
 def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Given]) -> None:
-    """Compute all samples, in this thread and in threads that it starts and joins. The last argument is an
-    array of the times of each sample.
+    """Write code that computes all samples, in the calling thread and in threads that it starts and joins.
+    The last of the arguments contains the times of each sample.
     """
     common = arguments.pop(arguments_of_samples(form) + 1) if w.device else None
     first = arguments_of_samples(form)
@@ -110,14 +111,15 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
 
 
 def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write `loop(job)`: run lanes until no sample is left."""
+    """Write `loop(job)`, which runs all lanes until no sample is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_lanes(w, form, method, job)
         w.give(w.null)
 
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
-    # for each lane the index of its sample and the number of its saved times; then the number of busy lanes
+    # `who`: for each lane the index of its sample, then for each the number of saved times; the number of
+    # busy lanes
     state = room_of_lanes(w, form)
     who = w.room(2 * w.lanes + 1, "i64")
     k = w.room(form.integrated * method.needed)
@@ -153,8 +155,8 @@ def begin_lane(
     number: Value,
     there: Value,
 ) -> None:
-    """Assign the sample with this index to a lane. Beyond the last sample the lane stays idle, with
-    the data of the first sample.
+    """Begin the sample with the index `number` in a lane. If there is no such sample (not `there`), the lane
+    is idle and uses the sampled inputs of the first sample.
     """
     if form.sampled:
         begin_samples(
@@ -183,9 +185,9 @@ def begin_lane(
 
 
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
-    """Return the rows of a lane's start as contiguous ranges, each with its source.
+    """Return the rows of a lane's start as contiguous ranges, each with its source in memory.
 
-    On a GPU, shared numbers that steps do not change are not copied.
+    On a GPU, shared numbers that steps do not change are not copied, and hence omitted.
     """
     count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
     found, shared = [], w.common if w.device else [False] * form.given
@@ -203,7 +205,7 @@ def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple
 
 
 def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:
-    """Return the saved time with this index for a sample."""
+    """Return the saved time with the index `number` of a sample."""
     rows = w.load(job, ROWS_OF_TIMES if w.device else COUNT, "i64")
     if w.device:
         lane = w.where(lane < rows, lane, 0)
@@ -211,7 +213,7 @@ def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Val
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
-    """Write `begin(job, state, who, lane)`: start the next sample of the batch in this lane."""
+    """Write `begin(job, state, who, lane)`, which begins the next sample of the batch in a lane."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = next_lane(w, job, NEXT)
         there = number < w.load(job, COUNT, "i64")
@@ -224,8 +226,8 @@ def _write_begin(w: MachineWriter, form: Form) -> None:
 
 
 def _write_serve(w: MachineWriter, form: Form) -> None:
-    """Write `serve(job, state, who, lane)`: save due states; if the sample has ended,
-    return it and begin the next one.
+    """Write `serve(job, state, who, lane)`, which saves due states. If the sample has ended, it stores the
+    results and begins the next sample.
     """
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form, state)
@@ -247,8 +249,8 @@ def _write_serve(w: MachineWriter, form: Form) -> None:
 
 
 def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> None:
-    """Write `save_within(job, state, who, k)`: save due states before the end of a step, from the Taylor
-    coefficients `k` at its start.
+    """Write `save_within(job, state, who, k)`, which saves the states that are due before the end of a step,
+    from the Taylor coefficients `k` at its start.
     """
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
@@ -279,7 +281,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
                     of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
                 )
                 w.store(saved + 1, who, lane + w.lanes)
-                # after the last time nothing is due, even if rounding puts an event just beyond it
+                # after the last time no state is due, even if rounding puts an event just beyond that time
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)
                 with w.when((saved + 1) < times):
                     lanes.set("goal", lane, goal_of(w, job, goals, number, saved + 1))
@@ -288,7 +290,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
 def _save(
     w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value
 ) -> None:
-    """Save the state of a lane at a due time. At the end, save it for all remaining
+    """Save the state of a lane at a due time. When the sample has ended, save its state for all remaining
     times and begin the next sample.
     """
     times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated

@@ -1,8 +1,8 @@
-"""The loop of `loop.py` as a function of JAX, with its derivative.
+"""The loop of `loop.py` as a differentiable JAX function.
 
-The derivative of a motion is a motion of states with their tangents. The loop itself finds the tangent of an
-event's time; all other times are numbers (`native_motion.py`). Tolerances and the first step have no
-derivative, nor have samples.
+The derivative of a motion is a motion whose state includes tangents. The loop itself computes the tangent of
+an event's time; all other times are constant here (`native_motion.py`). Tolerances, the first step and
+samples have no derivatives.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ MOST_KERNELS = 64  # number of cached kernels; their machine code lives as long 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
-    """Return the kernel of the integrated form, by a tableau or by Taylor series of an order."""
+    """Return the kernel for a form, by a tableau, or by Taylor series if an `order` is given."""
     steps = method if order is None else TaylorSteps(order)
 
     def shapes(*arguments):
@@ -62,11 +62,13 @@ OF_SAMPLES = (
 
 
 def flow(form: Form, method: Method, order: int | None) -> Loop:
-    """Return the motion by a kernel. `order`: order of a Taylor series, which replaces the tableau."""
+    """Return the motion as a function of its start. `order`: order of Taylor series, used in place of the
+    tableau.
+    """
 
     def motion(form: Form) -> Loop:
-        # above 36_000 products of coefficients, Taylor steps with second derivatives
-        # are replaced by the tableau
+        # for second derivatives, the tableau replaces Taylor series of more than 36_000 products of
+        # coefficients
         too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
         return kernel(form, method, None if too_many else order)
 
@@ -79,8 +81,8 @@ def flow(form: Form, method: Method, order: int | None) -> Loop:
 
 
 def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[Form, Start], None]) -> Loop:
-    """Return the motion of a form. Its derivative is the motion of a state with one more tangent; `check`
-    raises an error if that form is not supported.
+    """Return the motion of a form as a differentiable function. Its derivative is the motion of a form with
+    more tangents; `check` raises an error if that form is not supported.
     """
     own = jax.custom_jvp(motion(form))
 
@@ -102,7 +104,7 @@ def differentiated(motion: Callable[[Form], Loop], form: Form, check: Callable[[
 
 
 def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
-    """Return the form and the start with these tangents added."""
+    """Return the form and the start, with the tangents `along` added."""
     every = (tuple(range(len(start.known[0]))), *form.moving)
     moves = [[not is_zero(dx) for dx in part] for part in along.known]
     moving = tuple(

@@ -1,7 +1,8 @@
-"""One motion by machine code: whether machine code applies, arguments of the kernel, and results.
+"""Integrate one motion by machine code: decide whether machine code applies, make the arguments of the
+kernel, and read its results.
 
-Inputs that are functions of time become part of the scalar program: time and their numbers replace their
-values. `time_shift.py` has the derivatives with respect to times.
+Inputs that are functions of time become part of the scalar program, which then depends on time and the
+numbers in these functions instead of the inputs. `time_shift.py` has the derivatives with respect to times.
 
     u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
 """
@@ -37,8 +38,8 @@ from jourdain_jax.program.graph import Unsupported
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
-    """Return each number of a function of time. For a tree of flags or tangents, return its entries instead
-    of the numbers (None: nothing).
+    """Return all numbers of a function of time as a flat list. If its arrays are replaced by flags or
+    tangents, repeat each of these for each number.
     """
     return [
         x
@@ -48,8 +49,8 @@ def numbers_of(channel: FunctionOfTime) -> list:
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers` and all of `channel.held`, with each number replaced by the next of `numbers`;
-    a part without replacements is None.
+    """Return `channel.numbers` and all of `channel.held` as arrays made of the next `numbers`. An array for
+    which a number is None is None.
     """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [
@@ -68,24 +69,24 @@ def _each(part, shape: Shape) -> list:
     return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
 
 
-# Limit on evaluated operations. Measured compile times: 15,000 operations of a chain of 128 trailers in 2.8 s
-# (XLA: 40 s), 18,000 of a chain of 23 joint angles in 1.2 s.
+# Limit on the number of operations. Measured compile times: 15,000 operations of a chain of 128 trailers take
+# 2.8 s (XLA: 40 s), 18,000 operations of a chain of 23 joint angles take 1.2 s.
 LARGEST_PROGRAM = 60_000
-MOST_PRODUCTS = 12_000  # limit on products of coefficients in a Taylor step, which is written out
+MOST_PRODUCTS = 12_000  # limit on products of coefficients in a Taylor step, whose code has no loops
 
 
 def reason_against(
     field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None
 ) -> str:
-    """Return why machine code cannot integrate a scene (by Taylor series, if an
-    `order` is given); empty if it can.
+    """Return why machine code cannot integrate a scene (by Taylor series if an `order` is given); empty if it
+    can.
     """
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
     if reason := ffi.reason_against():
         return reason
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
-        return "the scene itself holds samples"
+        return "the scene itself has a sampled input"
     if not all(
         isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels
     ):
@@ -128,8 +129,8 @@ def _reason_against_series(form: Form, order: int) -> str:
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
-    """Return the form for machine code; `most`: maximum number of transitions of a motion; `stopping`:
-    whether other events end it.
+    """Return the form for machine code. `most`: maximum number of transitions of a motion; `stopping`:
+    whether stop events end it.
     """
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Sampled))
@@ -151,8 +152,8 @@ def modes_among(inputs: Inputs) -> Indices:
 def cotangents(
     form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, found: Solved, g: Solved
 ) -> tuple[Integrated, list]:
-    """Return cotangents of the start, and of each requested known number (`asked`), from
-    the results and their cotangents.
+    """Return the cotangents of the start and of each requested known number (`asked`), from the results
+    `found` and their cotangents `g`.
 
     `memory`: limit in bytes for records of steps.
     """
@@ -160,7 +161,7 @@ def cotangents(
     check_derivatives(form, 1)
     ends = jnp.concatenate([g.y_end.rows, g.t_end[None], g.passed.ts[: form.transitions]])
     tries = found.accepted + found.rejected
-    if form.has_events:  # counts omit the trial steps that locate an event, of which few events need eight
+    if form.has_events:  # trial steps that locate an event are not counted; few events need as many as eight
         tries += 8 * (1 + found.crossings + jnp.isfinite(found.passed.ts).sum())
     back = flow_back(form, method, which, memory)(
         start, cotangents_of_states(g), ends, jnp.asarray(tries, real_type())
@@ -170,15 +171,15 @@ def cotangents(
 
 
 def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
-    """Return cotangents of the states at all goals from the cotangents of the results."""
+    """Return the cotangents of the states at all goals from the cotangents of the results."""
     states = jax.vmap(lambda y: y.rows)(g.ys)
-    # zero for the last one, which is the end state
+    # zero for the last goal, because the end state has its own cotangent
     return jnp.concatenate([states, jnp.zeros_like(states[:1])])
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """Return a function that shifts a state at time t along its rates by a time d. The value of d is zero:
-    it only carries derivatives.
+    """Return a function of a state, its time t and a shift d, which shifts the state along its rates by d.
+    The value of d is zero: it only carries derivatives.
     """
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(rates_of_all(form))
 
@@ -201,9 +202,9 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 
 
 def start_of(setup: Setup, begun: Begun) -> Start:
-    """Return the arguments of a kernel for a motion."""
+    """Return the arguments of the kernel for a motion."""
     knots, goals = setup.knots, setup.times.goals
-    # zeros for sampled inputs, which are interpolated
+    # zeros stand for sampled inputs, which the kernel interpolates
     known, plain = (
         tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
         for part in (known_of(begun.args), known_of(begun.plain.args) if begun.plain else ())
@@ -214,7 +215,7 @@ def start_of(setup: Setup, begun: Begun) -> Start:
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
-    """Return the numbers of the modes at the start."""
+    """Return the modes at the start, as indices of their values."""
     return tuple(
         jax.lax.stop_gradient(jnp.asarray(channel.value, real_type()))
         for channel in inputs.channels
@@ -230,7 +231,7 @@ def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scala
 
 def known_of(args: tuple) -> list:
     """Return the known numbers of the rates: numbers that depend only on parameters, numbers of functions of
-    time, and constant inputs. Sampled inputs have None.
+    time, and constant inputs. Entries of sampled inputs are None.
     """
     _, _, inputs, fixed, _ = args
     functions = [
@@ -244,7 +245,9 @@ def known_of(args: tuple) -> list:
 
 
 def with_known(inputs: Inputs, known: Sequence) -> Inputs:
-    """Return inputs with their numbers replaced, in the order of `known_of` but without the fixed ones."""
+    """Return inputs with their numbers replaced by `known`, in the order of `known_of` without the fixed
+    ones.
+    """
     each = iter(known)
     new = [
         x
@@ -275,7 +278,7 @@ def others_of(inputs: Inputs) -> list[Callable]:
 def _samples(
     args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None
 ) -> tuple[Array, ...]:
-    """Return tables of the sampled inputs, and the knots, in the kernel's layout; empty if there are none."""
+    """Return the tables and knots of sampled inputs, as arguments of the kernel; empty if there are none."""
     _, _, inputs, _, origin = args
     origin = jax.lax.stop_gradient(origin)  # samples are interpolated at fixed times since the start
     channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]

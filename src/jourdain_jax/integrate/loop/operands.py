@@ -1,8 +1,8 @@
-"""Operands of a machine-code call, joined to the arrays that it takes on a CPU and on a GPU.
+"""Join the operands of a machine-code call to the arrays that it takes on a CPU or a GPU.
 
-The rows of a start are vectors and numbers, some of them with a batch axis. On a CPU they are
-joined lane by lane. On a GPU shared rows form a separate array without batch axis, and so do
-saved times if lanes share them.
+The rows of a start are vectors and numbers, some of them with a batch axis. On a CPU they become one array
+with a batch axis. On a GPU, the rows that all lanes share form a separate array without batch axis. Saved
+times also have no batch axis if lanes share them.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ class Operands(NamedTuple):
     ranks: tuple[int, ...]  # ranks of the operands without batch axes
     samples: int  # number of leading operands that are samples
     others: int  # number of trailing operands that are separate arrays; those in between are rows of a start
-    # rows of a start that are not operands: index of the first, and values
+    # rows of a start that are not operands: index of the first row, and values
     constant: tuple[tuple[int, tuple[float, ...]], ...]
     counted: bool  # whether the last operand is the number of trial steps, which a CPU does not take
 
     def _laned(self, x: Array, rank: int) -> Array:
-        """Return the operand with all batch axes."""
+        """Return an operand with all batch axes."""
         shape = (*self.batch, *x.shape[x.ndim - rank :])
         return lax.broadcast_in_dim(x, shape, range(len(shape) - x.ndim, len(shape)))
 
     def _rows(self, values: Sequence) -> list[tuple[Any, int, bool]]:
-        """Return each vector, number or constant of a start with its rank, and whether all lanes share it."""
+        """Return each vector, number or constant of a start, with its rank and whether all lanes share it."""
         constant, row, found = dict(self.constant), 0, list[tuple[Any, int, bool]]()
         operands = [*range(self.samples, len(values) - self.others)]
         while operands or row in constant:
@@ -45,12 +45,12 @@ class Operands(NamedTuple):
         return found
 
     def shared(self, values: Sequence) -> tuple[bool, ...]:
-        """Return which rows of a start all lanes share."""
+        """Return for each row of a start whether all lanes share it."""
         rows = self._rows(values)
         return tuple(is_shared for x, rank, is_shared in rows for _ in range(x.shape[-1] if rank else 1))
 
     def _joined(self, rows: list, dtype, laned: bool) -> Array:
-        """Join rows to one array, with or without batch axes. Neighbours with equal batch axes are joined
+        """Join rows to one array; `laned`: with all batch axes. Neighbours with equal batch axes are joined
         first; then the missing axes are added.
         """
         found = []
@@ -68,15 +68,15 @@ class Operands(NamedTuple):
         return lax.concatenate(found, found[0].ndim - 1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
-        """Return the arrays for a CPU: the batch axis is first, except in samples that lanes share."""
+        """Return the arrays for a CPU. The batch axis is first; samples that lanes share have none."""
         rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
         start = self._joined(rows, values[-1].dtype, True)
         return [*values[: self.samples], start, *map(self._laned, values[last:end], self.ranks[last:end])]
 
     def given_once(self, *values: Array) -> list[Array]:
-        """Return the arrays for a GPU: the shared rows of a start follow the others, without batch axis. If
-        all lanes share the times, the times have no batch axis either. Of numbers of trial steps the largest
-        is taken.
+        """Return the arrays for a GPU. The shared rows of a start form an array of their own, without batch
+        axis, after that of the other rows. If all lanes share the times, these have no batch axis either. The
+        number of trial steps is the largest of the batch.
         """
         if not self.others:
             return self.side_by_side(*values)

@@ -1,18 +1,20 @@
-"""Projection of coordinates or speeds as machine code: `equations/projection.py` on the scalar program of the
-constraints, for several lanes.
+"""Projection of coordinates or speeds in machine code: the method of `equations/projection.py` on the scalar
+program of the constraints, for several lanes.
 
     x <- x - W (d A W)+ d r(x),   A = dr/dx for the free variables,   d: reciprocal row lengths
 
-r: geometric constraints (x: coordinates) or velocity constraints (x: speeds); W = 1, or W = c L'^-1 with c M
-c = L L' for speeds nearest in the metric of the mass matrix. Converged lanes stay unchanged.
+r: geometric constraints (x: coordinates) or velocity constraints (x: speeds); W = 1, or W = c L'^-1 with
+c M c = L L' for the nearest speeds in the metric of the mass matrix. Lanes that have converged do not change.
 
-Dense linear algebra is written as loops, one matrix per lane: entries are vectors in memory, row by row.
+Dense linear algebra is written as loops. Each lane has its own matrix; an entry for all lanes is a vector in
+memory, and entries are stored row by row.
 
     A+ = B' S^-2 J,   J A = B with orthogonal rows of lengths S     one-sided Jacobi rotations J
     M = L L'                                                        Cholesky
 
 Sources: M. R. Hestenes, J. SIAM 6 (1958) 51-90, with rows instead of columns; J. Demmel and K. Veselic, SIAM
-J. Matrix Anal. Appl. 13 (1992) 1204-1245, on its accuracy. Results of a lane depend only on its own numbers.
+J. Matrix Anal. Appl. 13 (1992) 1204-1245, on its accuracy. The results of a lane depend only on its own
+numbers.
 """
 
 import math
@@ -45,8 +47,8 @@ def cleared(w: MachineWriter, place: Value, count: int) -> None:
 
 
 def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
-    """Write `rotated(B)`: make the rows of B orthogonal in their first `columns` entries; the following
-    `rows` entries rotate with them.
+    """Write `rotated(B)`, which rotates the rows of B until their first `columns` entries are orthogonal. The
+    other `rows` entries rotate with them.
     """
     width = rows + columns
     with w.procedure("rotated", "B") as (B,):
@@ -78,8 +80,8 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> None:
-    """Write `inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter
-    than `cutoff` times the longest.
+    """Write `inverted(B, weights)`, which computes, after `rotated`, the weights S^-2 of the rows. Rows
+    shorter than `cutoff` times the longest have zero weight.
     """
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
@@ -96,7 +98,7 @@ def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> 
 
 
 def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
-    """Write `solved(B, weights, b, x)`: x = A+ b."""
+    """Write `solved(B, weights, b, x)`, which computes x = A+ b."""
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
         cleared(w, x, columns)
@@ -137,7 +139,7 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
 
 
 def write_triangular(w: MachineWriter, n: int) -> None:
-    """Write `forward(L, x)` and `backward(L, x)`: replace x by L^-1 x and L'^-1 x."""
+    """Write `forward(L, x)` and `backward(L, x)`, which replace x by L^-1 x and by L'^-1 x."""
     with w.procedure("forward", "L x") as (L, x), w.counted(n) as i:
         row = w.at(L, i * n)
         w.store((w.load(x, i) - _product_of_rows(w, row, x, i)) / w.load(row, i), x, i)
@@ -157,7 +159,7 @@ Kind = Literal["positions", "speeds", "determined speeds"]
 
 @dataclass(frozen=True)
 class Rows:
-    """The projected variables and their constraints."""
+    """Variables to project, and their constraints."""
 
     program: RowProgram
     kind: Kind
@@ -186,8 +188,8 @@ class Rows:
 
     @property
     def given(self) -> list[int]:
-        """Return the nodes of a sample's arguments. Flags of free entries and typical lengths of
-        the constraints follow them.
+        """Return the nodes of a sample's arguments. They are followed by flags of free entries and typical
+        lengths of the constraints.
         """
         program = self.program
         return [
@@ -202,9 +204,9 @@ class Rows:
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
-        # Entries of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone,
-        # 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20, 0.32 and 0.18; of 32
-        # 14.6 and 1.4, 3.6 and 1.2.
+        # Limit on entries of a matrix. Measured in ms for speeds of trailers, by machine code and by XLA,
+        # alone, then per sample of a batch: 6 trailers 0.10 and 0.08, 0.05 and 0.06; 12 trailers (2,812
+        # entries) 0.68 and 0.20, 0.32 and 0.18; 32 trailers 14.6 and 1.4, 3.6 and 1.2.
         if max((rows + columns) * rows, columns**2) > 3_000:
             return "there are too many constraints"
         nodes = [
@@ -218,8 +220,8 @@ class Rows:
 
 
 def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
-    """Write the module. It takes `of.given`, flags of free entries, and lengths, and returns the
-    projected variables and the residual.
+    """Write the module of a projection. Its arguments are `of.given`, flags of free entries, and typical
+    lengths; its results are the projected variables and the residual.
 
     `cutoff`: singular values below this fraction of the largest count as zero.
     """
@@ -241,7 +243,7 @@ def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
 
 
 def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) -> None:
-    """Write `name(state, found)`: values of nodes, each at its place in `found`."""
+    """Write a function `name(state, found)`, which stores the values of nodes at their places in `found`."""
     with w.procedure(name, "state found") as (state, found):
         known = {n: w.load(state, k) for k, n in enumerate(of.given)}
         places = list(nodes)
@@ -250,8 +252,8 @@ def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) 
 
 
 def _write_metric(w: MachineWriter, of: Rows) -> None:
-    """Write `metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled
-    speeds, with identity rows for held speeds.
+    """Write `metric(state, L, c)`, which computes the scales c of the speeds, and the Cholesky factor L of
+    the mass matrix in scaled speeds, with identity rows for held speeds.
     """
     n, first_free = len(of.moving), len(of.given)
     with w.procedure("metric", "state L c") as (state, L, c):
@@ -268,16 +270,16 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
 
 
 def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
-    """Return the scale of a speed from its diagonal entry of the mass matrix, as
-    `equations/scaling.speed_scale`.
+    """Return the scale of a speed from its diagonal entry of the mass matrix, as in
+    `equations/scaling.py: speed_scale`.
     """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 
 
 def _write_factored(w: MachineWriter, of: Rows) -> None:
-    """Write `factored(state, L, c, B, d, weights)`: the matrix of the constraints after
-    `rotated`, and its row scales.
+    """Write `factored(state, L, c, B, d, weights)`, which computes the matrix of the constraints, applies
+    `rotated` and `inverted` to it, and stores its row scales in d.
     """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
@@ -308,7 +310,9 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_moved(w: MachineWriter, of: Rows) -> None:
-    """Write `moved(state, L, c, B, d, weights, x)`: one step of the variables by the `factored` matrix."""
+    """Write `moved(state, L, c, B, d, weights, x)`, which makes one step of the variables by the `factored`
+    matrix.
+    """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
     with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):
@@ -322,12 +326,12 @@ def _write_moved(w: MachineWriter, of: Rows) -> None:
         with w.counted(columns) as k:
             change = w.load(x, k)
             change = change if of.metric is None else change * w.load(c, k)
-            moves = w.load(state, k + first_free) > 0.0  # held variables do not even move by round-off
+            moves = w.load(state, k + first_free) > 0.0  # held variables must not change even by round-off
             w.store(w.load(state, k + first) - w.where(moves, change, 0.0), x, k)
 
 
 def _write_row(w: MachineWriter, of: Rows) -> None:
-    """Write `row(state, found)`: map the arguments of a block of samples to results."""
+    """Write `row(state, found)`, which computes the results of a block of samples from their arguments."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
     with w.procedure("row", "state found") as (state, found):
@@ -342,7 +346,7 @@ def _write_row(w: MachineWriter, of: Rows) -> None:
 def _write_putting(
     w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value
 ) -> None:
-    """Write the projection in place."""
+    """Write code that projects the variables in place."""
     if of.metric is not None:
         w.run("metric", state, *factors[:2])
     if not of.affine:
@@ -356,7 +360,7 @@ def _write_putting(
 
 
 def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:
-    """Write the iteration until steps change nothing, as in `calculus/roots.py`."""
+    """Write the iteration, which ends when steps no longer change the variables (see `calculus/roots.py`)."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(0.0, quiet)

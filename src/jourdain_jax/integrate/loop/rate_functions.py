@@ -1,14 +1,14 @@
-"""Rates, projection and stop events of a lowered scene as machine code: functions of the rows of the lanes,
-the time since the start, and a state in memory.
+"""Rates, projection and events of a lowered scene in machine code: functions of the rows of the lanes, the
+time since the start, and a state in memory.
 
-If tangents follow the state, each function also returns the tangents of its results. Further functions return
+If the state has tangents, each function also computes the tangents of its results. Further functions compute
 cotangents:
 
     d f(t, y, p) = df/dy dy + df/dp dp          p: known numbers; those of `Form.moving` have tangents
     G_y = (df/dy)' g,   G_p += (df/dp)' g       g: cotangents of f; for the requested p
 
-A second derivative adds the tangents of all these numbers along a second direction. Cotangents of a motion
-with its tangents give the second derivatives.
+Second derivatives have tangents of all these numbers along a second direction. In reverse mode, they are
+cotangents of a motion with its tangents.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,21 @@ from jourdain_jax.program.graph import Graph, NodeList
 
 
 class Outputs(NamedTuple):
-    """Nodes with their tangents, on a separate graph if there are tangents."""
+    """Nodes and their tangents, on a separate graph if there are tangents."""
 
     graph: Graph
     values: NodeList
     tangents: list[NodeList]  # one list per tangent
     variables: NodeList  # variables of the scene's program
-    states: list[NodeList]  # inputs: tangents of the state
-    known: NodeList  # inputs: tangents of known numbers, all of the first direction first
-    times: NodeList  # inputs: tangents of time
-    slopes: NodeList  # inputs: time derivatives of sampled inputs
+    # input nodes:
+    states: list[NodeList]  # tangents of the state
+    known: NodeList  # tangents of known numbers, ordered by direction
+    times: NodeList  # tangents of time
+    slopes: NodeList  # time derivatives of sampled inputs
 
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
-    """Return the nodes with tangents of the first `pushed` of them."""
+    """Return nodes, with tangents of the first `pushed` of them."""
     program, count = form.program, len(form.moving)
     if not count:
         return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
@@ -54,7 +55,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     sampled = {len(y) + len(fixed) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
-    # all varying quantities, then their tangents, in this order
+    # the varying quantities, then the tangents of each direction, by index in this order
     given = [dict(enumerate([*y, *fixed, *inputs, t]))]
     for k in range(count):
         of_time = (
@@ -75,7 +76,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
 def _found(
     w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value
 ) -> tuple[list[Value], list[list[Value]]]:
-    """Return the values of outputs and their tangents; `known`: from `known_values`."""
+    """Return the values of outputs and of their tangents. `known`: result of `known_values`."""
     given = given_values(w, form, own, known, state, tau, y)
     found = [
         as_real(w, x)
@@ -88,7 +89,7 @@ def _found(
 def given_values(
     w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value
 ) -> dict[int, Value]:
-    """Return the values of the input nodes of outputs; `known`: from `known_values`."""
+    """Return the values of the input nodes of outputs. `known`: result of `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
@@ -118,11 +119,11 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
 
 
 def write_rates(w: MachineWriter, form: Form) -> None:
-    """Write `rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and the
-    monitored quantities, pivots first.
+    """Write `rates(state, tau, y, k, pivots)`, which stores the rates of the state `y` in `k`, and the
+    monitored quantities, pivots first, in `pivots`.
     """
     program = form.program
-    # inline small programs at each stage
+    # small programs are inlined at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
@@ -139,7 +140,7 @@ def write_rates(w: MachineWriter, form: Form) -> None:
 
 
 def write_projection(w: MachineWriter, form: Form) -> None:
-    """Write `project(state, tau, y)`: project the state `y` onto the constraints."""
+    """Write `project(state, tau, y)`, which projects the state `y` onto the constraints."""
     program = form.program
     with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
         known = known_values(w, form, state, tau, y)
@@ -161,8 +162,8 @@ def write_projection(w: MachineWriter, form: Form) -> None:
 
 
 def _write_along(w: MachineWriter, form: Form) -> None:
-    """Write `along(state, tau, y)`: keep only the part of a state's error along the constraints, because a
-    projection removes the rest.
+    """Write `along(state, tau, y)`, which projects the error of a state, stored after it, onto the directions
+    that the constraints allow, because the projection of the state removes the rest.
     """
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
@@ -175,8 +176,8 @@ def _write_along(w: MachineWriter, form: Form) -> None:
 
 @lru_cache(maxsize=64)
 def event_program(form: Form) -> Outputs:
-    """Return stop events and their rates, as functions of a state and its rates. Raises `Unsupported` for
-    operations without derivative on the graph.
+    """Return events and their rates, as functions of a state and its rates. Raises `Unsupported` for
+    operations that have no derivative on the graph.
 
         dc/dt = sum dc/dx_i dx_i/dt
     """
@@ -188,8 +189,8 @@ def event_program(form: Form) -> Outputs:
 
 
 def write_events(w: MachineWriter, form: Form) -> None:
-    """Write `events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and
-    their rates if `y` changes at the rate `slope`.
+    """Write `events(state, tau, y, slope, c, rate)`, which stores the values c of all events for the state
+    `y`, and their rates if `y` changes at the rate `slope`.
     """
     program, own, count = form.program, event_program(form), form.events
     with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
@@ -214,7 +215,8 @@ def write_events(w: MachineWriter, form: Form) -> None:
                 w.store(x, dc, i)
 
 
-# Limits on the operations of first and second derivatives. Reverse mode keeps some on the stack.
+# limits on the operations of first and second derivatives, because reverse mode keeps some values on the
+# stack
 LARGEST_DERIVATIVE = 10_000, 40_000
 
 
@@ -223,7 +225,7 @@ class Pulled(NamedTuple):
 
     own: Outputs
     found: NodeList
-    weights: dict[int, int]  # row of a result -> input for its cotangent
+    weights: dict[int, int]  # input node for the cotangent of a result, by row of the result
 
     @property
     def graph(self) -> Graph:
@@ -232,14 +234,14 @@ class Pulled(NamedTuple):
 
 
 def check_derivatives(form: Form, order: int) -> None:
-    """Raise DifferentiationModeError if machine code has no derivatives of this order for a form."""
+    """Raise DifferentiationModeError if machine code cannot compute derivatives of this order for a form."""
     if reason := reason_against_derivatives(form, order):
         raise DifferentiationModeError(f'{reason}; use `jj.simulate(..., backend="xla")`')
 
 
 @lru_cache(maxsize=64)
 def reason_against_derivatives(form: Form, order: int) -> str:
-    """Return why machine code has no derivatives of this order for a form; empty if it has."""
+    """Return why machine code cannot compute derivatives of this order for a form; empty if it can."""
     if order > len(LARGEST_DERIVATIVE):
         return (
             "`simulate` was differentiated three times, but machine code has only first and second"
@@ -263,10 +265,11 @@ def reason_against_derivatives(form: Form, order: int) -> str:
 
 
 def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
-    """Write `pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`;
-    `asked`: indices of the requested known numbers.
+    """Write `pull_rates`, `pull_q`, `pull_u` and `pull_events`, each with the arguments `(state, tau, y, g,
+    to_y, to_known)`, which pull cotangents back. `asked`: indices of the requested known numbers.
 
-    For a state with a tangent, also write `pull_moved`; events are then functions of the state alone.
+    If the state has a tangent, also write `pull_moved`; `pull_events` then treats events as functions of the
+    state without tangents.
     """
     for name, nodes in steps_of(form).items():
         _write_one_pulled(
@@ -281,7 +284,9 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
 
 
 def steps_of(form: Form) -> dict[str, NodeList]:
-    """Return the parts of a step: rates, the whole state after each part of a projection, and stop events."""
+    """Return the nodes of the parts of a step: rates, the whole state after each part of a projection, and
+    events.
+    """
     program, (_, _, y, _) = form.program, form.split(form.program.variables)
     q, u = y[: form.coordinates], y[form.coordinates :]
     found = {"rates": form.rates}
@@ -292,7 +297,7 @@ def steps_of(form: Form) -> dict[str, NodeList]:
 
 
 def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushed: int) -> Pulled:
-    """Return the cotangents through nodes, of which the first `pushed` have tangents."""
+    """Return the cotangents pulled back through nodes; the first `pushed` nodes have tangents."""
     own = outputs_of(form, nodes, pushed)
     if not form.moving:
         graph, values, variables = on_its_own(own.graph, own.values, own.variables)
@@ -309,18 +314,19 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
 
 
 def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> NodeList:
-    """Return the nodes of the state, of its tangents, and of the requested numbers."""
+    """Return the nodes of the state, of its tangents, and of the requested known numbers."""
     fixed, _, y, inputs = form.split(own.variables)
     return [*y, *(n for part in own.states for n in part), *([*fixed, *inputs][i] for i in asked)]
 
 
 def _moved(form: Form, asked: Sequence[int]) -> Pulled:
-    """Differentiate the contribution of a stop event to the tangent of a state at a fixed time, and the
-    tangent of the event's time,
+    """Return the cotangents pulled back through the effect of an event on the tangents of its time and of the
+    state at a fixed time:
 
         dt = -dc/cdot,   dy <- dy + f dt,   dc = dc/dy dy + dc/dp dp,   cdot = dc/dt + dc/dy f
 
-    The row after the state is for dt. The last row is the time derivative of the whole contribution.
+    The row after the state contains the cotangent of dt. The last result is the derivative with respect to
+    time.
     """
     nodes = form.rates
     own = outputs_of(form, [*nodes, *form.program.events], len(nodes) + form.events)

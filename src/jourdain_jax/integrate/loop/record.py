@@ -1,10 +1,10 @@
-"""Record of the steps of a motion for reverse mode (`adjoint.py`): one slot per trial
-step, for all lanes of a block.
+"""Record of the steps of a motion for reverse mode (`adjoint.py`): one slot per trial step, for all lanes of
+a block.
 
-The memory of the model, shared by all threads, limits the number of slots. On a CPU the record
-grows up to this limit; on a GPU it has a slot for each trial step that the forward call has
-counted, up to this limit. If a motion takes more steps, its lanes run forward again for each
-window of slots, the last window first.
+The number of slots is limited by the model's `memory`, which all threads share. On a CPU, the record grows up
+to this limit. On a GPU, it has a slot for each trial step that the forward call counted, up to the same
+limit. If a motion takes more steps, its lanes run forward again for each window of slots, the last window
+first.
 """
 
 import math
@@ -24,7 +24,10 @@ TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: the state, its derivatives, then the rows of a transition; `all`: their number."""
+    """Row numbers in a slot. The state comes first, then: the rates `y` at the stages, the time `t`, the
+    advance `taken`, the number of times `saved` before, and the rows of a transition (`left`). `all`: total
+    number of rows.
+    """
 
     y: int
     t: int
@@ -41,8 +44,8 @@ class Slot(NamedTuple):
 
 
 class _Rooms(NamedTuple):
-    """Memory of a block: for each lane the index in the batch, the number of saved times and its
-    cotangents; the number of slots used.
+    """Memory of a block: for each lane its rows, the index `who` of its sample, the number of saved times and
+    the cotangents; the number `tries` of slots used.
     """
 
     state: Value
@@ -60,17 +63,17 @@ class _Rooms(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """Locations of slots; each function takes the index of a trial step."""
+    """Access to the slots. Functions take the index of a trial step."""
 
     slots: Value  # number of slots
-    free: Callable[[Value], Value]  # where to write the slot
-    keep: Callable[[Value], None]  # to be called afterwards
-    kept: Callable[[Value], Value]  # where to read the slot
-    lost: Callable[[], Value]  # whether memory is exhausted
+    free: Callable[[Value], Value]  # returns the place to write a slot
+    keep: Callable[[Value], None]  # completes the writing of a slot
+    kept: Callable[[Value], Value]  # returns the place to read a slot
+    lost: Callable[[], Value]  # returns whether memory is exhausted
 
 
 def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
-    """Write, inside a function, the forward and backward passes of all lanes until no sample is left."""
+    """Write code that runs the forward and backward passes of all lanes until no sample is left."""
     slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
     lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
     places = _on_gpu(w, slot, job) if w.device else _on_cpu(w, slot, memory)
@@ -107,7 +110,7 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
 
 
 def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
-    """Write the parts of the module that a record of this size in bytes needs."""
+    """Write the parts of the module that the record needs. `memory`: its size in bytes."""
     if w.device:
         w.record = Slot.of(form, method).all, memory
     else:
@@ -115,8 +118,8 @@ def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
 
 
 def _write_more_room(w: MachineWriter) -> None:
-    """Write `more_room(old, bytes)`: allocate twice as many bytes and copy the old content. The result
-    is null if there is no memory.
+    """Write `more_room(old, bytes)`, which allocates twice as many bytes and copies the old contents. It
+    returns null if there is not enough memory.
     """
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
         new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
@@ -128,12 +131,12 @@ def _write_more_room(w: MachineWriter) -> None:
 
 
 def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
-    """Return slots that fit into a third of each thread's memory: a full record is copied to one of twice its
-    size, and both exist meanwhile.
+    """Return access to slots that fit into a third of each thread's memory. The limit is a third, because a
+    full record is copied to a record of twice its size, and both exist at the same time.
     """
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)
-    # memory for 64 slots at first, then doubled
+    # the record begins with 64 slots, and doubles when full
     slots, first = w.literal(most, "i64"), w.literal(min(64, most) * size, "i64")
     record, bytes_there = w.room(type="ptr"), w.room(type="i64")
     w.store(first, bytes_there)
@@ -161,7 +164,7 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
-    """Return the slots of a thread. The numbers of neighbouring threads are interleaved."""
+    """Return access to the slots of a thread. Numbers of neighbouring threads are interleaved in memory."""
     here, (thread, threads) = w.room(slot.all), w.thread()
     record, slots = w.at(w.load(job, RECORD, "ptr"), thread), w.load(job, SLOTS, "i64")
 
@@ -179,14 +182,14 @@ def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
 
 
 def _take(w: MachineWriter, job: Value, who: Value) -> None:
-    """Take the next samples of the batch into `who`; -1 if there is none."""
+    """Write code that stores the indices of the next samples of the batch in `who`, -1 if there is none."""
     with w.each_lane() as lane:
         number = next_lane(w, job, NEXT)
         w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
 
 
 def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> None:
-    """Set all lanes to their starts."""
+    """Write code that sets all lanes to their starts."""
     with w.counted(form.all) as row:
         w.store(1.0, rooms.state, row)
     with w.each_lane() as lane:
@@ -197,7 +200,7 @@ def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> N
 
 
 def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
-    """Write a trial step and its slot `here`."""
+    """Write code that makes a trial step and records it in the slot `here`."""
     lanes = Lanes(w, form, rooms.state)
     copied(w, form.integrated, rooms.state, here)
     w.store(lanes["t"], here, slot.t)
@@ -211,7 +214,7 @@ def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Ro
 
 
 def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """Initialise the cotangents with the cotangents of the end states of a block."""
+    """Write code that initialises the cotangents of a block with those of its end states."""
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
     each_row(w, form.integrated, g, lambda i: 0.0)
@@ -222,7 +225,7 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
             taken_in(
                 w, form.integrated, of_lane(w, ends, w.load(job, COUNT, "i64"), form.ends, number), g, lane
             )
-    # unreached times repeat the last state
+    # the saved states at unreached times are the last state
     all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
     w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
     if form.has_events:
@@ -232,7 +235,7 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
 def _write_try_back(
     w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value
 ) -> None:
-    """Go back over the trial step in a slot."""
+    """Write code that pulls cotangents back through the trial step in the slot `here`."""
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
     w.store(before, rooms.saved)
@@ -245,7 +248,7 @@ def _write_try_back(
 
 
 def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """Write the results of a block."""
+    """Write code that stores the results of a block."""
     g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
@@ -258,7 +261,9 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
 
 
 def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:
-    """Return NaN for this block and all remaining samples, because memory is exhausted."""
+    """Write code that stores NaN as results of this block and all remaining samples, because memory is
+    exhausted.
+    """
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 
     def lost(number: Value) -> None:

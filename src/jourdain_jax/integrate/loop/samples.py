@@ -1,13 +1,14 @@
-"""Linear interpolation of sampled inputs in machine code:
+"""Interpolate sampled inputs linearly, in machine code:
 
     f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1}
     df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
 
 f is constant before the first sample and after the last.
 
-Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every sampled
-input, padded with infinite times. Knots, the times at which steps must end (`integrate/input_knots.py`), have
-the shape (rows, knots). Lanes may share them: with T tables, lane i of N uses number i T / N.
+Tables have the shape (tables, inputs, 2, samples): for each sampled input the times since the start, padded
+with infinity, then the values. Knots, the times at which steps must end (`integrate/input_knots.py`), have
+the shape (rows, knots). Samples of a batch may share tables and knots: if there are T tables, sample i of N
+uses table i T / N.
 """
 
 from jourdain_jax.integrate.loop.form import Form
@@ -15,13 +16,14 @@ from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter
 from jourdain_jax.kernels.ffi import Given, last_size, product
 from jourdain_jax.kernels.ir_value import Value
 
-# words of a job: pointers to tables and knots, their numbers, samples per table, knots per row
+# words of a job: pointers to tables and knots, numbers of tables and rows of knots, samples per table, knots
+# per row
 WORDS_OF_SAMPLES = 6
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
 
 
 def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
-    """Store the location of samples in the words of a job."""
+    """Write code that stores the locations of tables and knots in the words of a job."""
     tables, knots = given
     for word, value in (
         (_TABLES, tables.data),
@@ -37,7 +39,7 @@ def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
 def begin_samples(
     w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value
 ) -> None:
-    """Assign the table and the knots of sample `number`, of `count` samples, to a lane."""
+    """Write code that assigns the table and the knots of sample `number` (of `count`) to a lane."""
     size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:
@@ -54,13 +56,13 @@ def begin_samples(
 
 
 def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
-    """Advance a lane to its next knot."""
+    """Write code that advances a lane to its next knot."""
     lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
 
 
 def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> None:
-    """Write `sampled_inputs(state, t, values)`: the values of all sampled inputs of each lane at the time t
-    since the start, then df/dt.
+    """Write `sampled_inputs(state, t, values)`, which stores the values of all sampled inputs of each lane at
+    the time t since the start, and then their rates df/dt if `with_slopes`.
     """
     with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
         lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
@@ -93,7 +95,9 @@ def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> Non
 
 
 def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
-    """Return the values of all sampled inputs at the time t since the start, then their slopes."""
+    """Return the values of all sampled inputs at the time t since the start, then their rates if
+    `with_slopes`.
+    """
     count = len(form.sampled) * (1 + with_slopes)
     values = w.room(count)
     w.run("sampled_inputs", state, t, values)

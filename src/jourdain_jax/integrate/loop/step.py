@@ -1,28 +1,29 @@
-"""One step of several lanes: an explicit Runge-Kutta method with embedded error estimate, and steps of
-the search for a stop event.
+"""One step of several lanes: an explicit Runge-Kutta method with embedded error estimate, and trial steps of
+the event search.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts
     h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
-This is the only source of a step. A writer object provides arithmetic, memory, branches and loops:
-`MachineWriter` (`lanes.py`) generates machine code, `ArrayWriter` (`integrate/arrays/array_writer.py`)
-computes with JAX arrays. Events, including events of relations (`lowering/sides.py`), are located by the
-formulas of `integrate/event_search.py`.
+Machine code and JAX arrays share this code of a step. A writer object provides arithmetic, memory, branches
+and loops: `MachineWriter` (`lanes.py`) generates machine code, `ArrayWriter`
+(`integrate/arrays/array_writer.py`) computes with JAX arrays. `integrate/event_search.py` locates events,
+including those of relations (`lowering/sides.py`).
 
-A step ends at every requested time and at every knot of the inputs; the step size before such a shortened
-step is remembered. The state advances by the difference of the rounded times at the ends of a step.
+Steps end at each requested time and at each knot of the inputs. After a step shortened for this purpose, the
+previous step size is used again. The state advances by the difference of the rounded times at the ends of a
+step.
 
-Near a loss of rank, let sigma be the sine between a constraint and the earlier ones. Round-off eps of a
-constraint then causes a velocity eps/sigma^2 across it, which dominates the error of short steps. If a step
-starts at sigma < 0.1, its stages are projected onto the constraints. Its error is the larger of two parts:
-the error along the constraints, less n^2, and the displacement by the projection, less n. Here n = 16
-eps/sigma^2, at most eps^0.4, for the smallest sigma of the stages; a displacement n across the constraints
-moves the state by n^2 along them. The position, not the tolerance, thus decides whether a motion passes a
-loss of rank.
+Near a loss of rank, let sigma be the sine of the angle between a constraint and the earlier ones. Round-off
+eps of a constraint then causes a velocity eps/sigma^2 across it, which dominates the error of short steps. If
+sigma < 0.1 at the start of a step, its stages are projected onto the constraints. Its error is the larger of
+two parts: the error along the constraints, less n^2, and the displacement by the projection, less n. Here n =
+16 eps/sigma^2, at most eps^0.4, for the smallest sigma of all stages; a displacement n across the constraints
+moves the state by n^2 along them. So the position decides whether a motion passes a loss of rank, and the
+tolerance does not.
 
-In single precision the state uses compensated summation (Kahan). Otherwise a state whose increments are below
-its last digit would stand still, undetected by the error estimate.
+In single precision, the state uses compensated summation (Kahan). Without it, a state whose increments are
+below its last digit would not change at all, and the error estimate would not detect this.
 """
 
 import math
@@ -43,28 +44,29 @@ from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, copied,
 from jourdain_jax.integrate.loop.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.integrate.relation_sides import first_sides
 
-NOISE = 0.6  # powers of round-off: eps^0.6 counts as noise anywhere, and at most eps^(1 - 0.6)
+# a relative displacement of eps^NOISE counts as noise; near a loss of rank, at most eps^(1 - NOISE)
+NOISE = 0.6
 
 
-IDLE = -9.0  # code of a lane slot without sample, or whose sample has saved all its times
+IDLE = -9.0  # code of a lane that has no sample, or whose sample has saved all its times
 
 
 class Trial(NamedTuple):
     """Trial step of all lanes."""
 
     aim: Aim
-    y1: Number  # pointer: the state after it
+    y1: Number  # pointer to the state after the step
     accept: Number
-    next_h: Number  # positive
+    next_h: Number  # length of the next step, positive
     pivot: Number | None  # smallest magnitude of a monitored pivot
-    fails: Number | None = None  # whether it ends the motion, with this code
+    fails: Number | None = None  # whether the step ends the motion with `code`
     code: Number | None = None
-    even: bool = False  # whether its length is fixed
+    even: bool = False  # whether the length of steps is fixed
 
 
 def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write `step(state, k)`: one trial step of all running lanes; `k`: memory for the rates of its
-    stages, or for Taylor coefficients.
+    """Write `step(state, k)`, which makes one trial step of all running lanes. `k`: memory for the rates of
+    its stages, or for Taylor coefficients.
     """
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form, state)
@@ -78,19 +80,19 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
 
 
 def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable) -> None:
-    """Try one step of all running lanes by the method `tried`."""
+    """Make one trial step of all running lanes. `tried`: function that returns the `Trial`."""
     first_sides(w, form, p)
     take(w, form, method, p, k, tried(w, form, method, p, k))
 
 
 def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number) -> Trial:
-    """Return a Runge-Kutta step, which ends at the next saved time at the latest."""
+    """Try a Runge-Kutta step, which ends at the next saved time at the latest."""
     aim = aimed(w, p, p["goal"], p["h"], p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     y1, error = w.room(form.integrated), w.room(form.y)
     w.in_step(p["t"], step)
     smallest, changed_sign, rank = stages(w, form, method, p, k, p["t"], step, y1)
-    # use every stage: comparisons hide a NaN of an earlier stage with weight zero
+    # include stages of weight zero, so that their NaN reaches the error; comparisons would hide it
     weights = method.b_error[: method.needed]
     each_row(w, form.y, error, lambda i: step * weighted(w, weights, k, form, i, every=True))
     if form.compensated:
@@ -105,7 +107,7 @@ def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Numb
 
 
 def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Callable[[Any], Number]) -> None:
-    """Add increments to the state with the round-off of earlier sums (Kahan), and store the new round-off."""
+    """Add increments and the round-off of earlier sums to the state (Kahan), and store the new round-off."""
     rest, first = w.at(p.pointer, form.rows["rest"].start), w.at(p.pointer, form.rows["next_rest"].start)
 
     def sums(i: Any) -> None:
@@ -118,8 +120,8 @@ def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Call
 
 
 def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k: Number) -> Trial:
-    """Return a step by Taylor series, which may pass saved times. Store the coefficients in `k`, followed by
-    the rates at the end of the step.
+    """Try a step by Taylor series, which may pass saved times. Store the coefficients in `k`, followed by the
+    rates at the end of the step.
     """
     count = form.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
@@ -170,8 +172,8 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
-    """Update the lanes after a trial step. `k`: derivatives at the stages,
-    starting with the one at the start.
+    """Update the lanes after a trial step. `k`: rates at the stages, beginning with those at the start of the
+    step.
     """
     y, count = p.pointer, form.integrated
     if form.goes_on:
@@ -179,7 +181,7 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
     aim, y1, accept, next_h, smallest = trial[:5]
     t1, locating = aim.t_1, aim.locating
     new = taken(w, p, aim, accept, next_h)
-    new["taken"] = w.where(accept, aim.h, 0.0)  # by how much the state has advanced
+    new["taken"] = w.where(accept, aim.h, 0.0)  # time by which the state has advanced
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
         ends = k, w.at(k, method.at_the_end * form.integrated)
@@ -203,20 +205,20 @@ def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -
 
 
 class Rank(NamedTuple):
-    """Closeness of the constraints to a loss of rank in a step."""
+    """How close the constraints are to a loss of rank in a step."""
 
-    near: Number  # at its start
+    near: Number  # whether they are close to it at the start of the step
     square: Number  # smallest squared sine between a constraint and the earlier ones, over all stages
 
 
 def stages(
     w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Number, step: Number, y1: Number
 ) -> tuple[Number, Number, Rank | None]:
-    """Return the smallest magnitude of a pivot, whether any pivot changed its sign, and the
-    distance from a loss of rank.
+    """Compute all stages of a step. Return the smallest magnitude of a pivot, whether any pivot changed its
+    sign or a constraint reversed, and the closeness to a loss of rank.
 
-    The rates of all stages are stored in `k`. The state of each stage is stored in `y1`, which finally holds
-    the state at the end of the step.
+    The rates of all stages are stored in `k`. The state of each stage is stored in `y1`; at the end, `y1`
+    contains the state at the end of the step.
     """
     every, n = form.integrated, method.needed
     pivots, square = w.room(max(len(form.monitored), 1)), w.room()
@@ -249,15 +251,15 @@ def stages(
 
 
 def unseen(w: StepWriter, form: Form) -> tuple:
-    """Return the initial values for monitoring: directions at the start, extremes of pivots, and
-    whether a constraint reversed.
+    """Return the initial values for monitoring: directions of constraints at the start, smallest and largest
+    values of pivots, and whether a constraint reversed.
     """
     low, high = ([w.number(x)] * form.pivots for x in (math.inf, -math.inf))
     return [w.number(0.0)] * form.turning, low, high, w.literal(0, w.truth)
 
 
 def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> tuple:
-    """Return the monitoring values after a stage with monitored numbers `pivots`."""
+    """Update the values for monitoring after stage `i`, whose monitored numbers are `pivots`."""
     first, low, high, turned = known
     now, directions = (
         [w.load(pivots, j) for j in range(a, a + count)]
@@ -270,8 +272,8 @@ def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> 
 
 
 def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
-    """Return the smallest magnitude of a pivot, and whether any pivot changed its
-    sign or a constraint reversed.
+    """Return the smallest magnitude of a pivot, and whether any pivot changed its sign or a constraint
+    reversed.
     """
     _, low, high, turned = known
     smallest = reduce(
@@ -285,8 +287,8 @@ def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
-    """Return, for each constraint, the square of its part normal to the earlier
-    ones, and the square of its size.
+    """Return two numbers for each constraint: its squared component normal to the earlier constraints, and
+    its squared size.
     """
     found = [
         w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))
@@ -295,8 +297,7 @@ def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Numbe
 
 
 def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
-    """Return whether some constraint nearly depends on earlier ones."""
-    # a sine below 0.1
+    """Return whether any constraint nearly depends on earlier ones: the sine between them is below 0.1."""
     return any_of([left < 0.1**2 * size for left, size in squares])
 
 
@@ -313,13 +314,13 @@ def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Num
 
 
 def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number]) -> Number:
-    """Return whether a constraint has reversed: its component along its first direction has
-    fallen below the permitted share.
+    """Return whether a constraint has reversed: its component along its direction at the start has fallen
+    below half of the initial value.
     """
     along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))
     width = max(form.speeds, 1)
     rows = [range(k, k + width) for k in range(0, form.turning, width)]
-    # half; a step that retains less is tried again
+    # a step in which a component falls below half is repeated
     lasting = [along(row, now) > 0.5 * along(row, first) for row in rows]
     return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
 
@@ -327,7 +328,7 @@ def turns_round(w: StepWriter, form: Form, first: list[Number], now: list[Number
 def weighted(
     w: StepWriter, weights: Number, k: Number, form: Form, row: int | Number, every: bool = False
 ) -> Number:
-    """Return `sum_j w_j k_j` for one number of the state; `every`: include terms of weight zero."""
+    """Return `sum_j w_j k_j` for one row of the state. `every`: include terms of weight zero."""
     first, *others = [j for j in range(len(weights)) if every or w.may_count(weights, j)]
     total = w.load(k, row + first * form.integrated) * weights[first]
     for j in others:
@@ -338,13 +339,13 @@ def weighted(
 def project(
     w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: Number, rank: Rank | None = None
 ) -> None:
-    """Project `y1` onto the constraints. The error becomes at least as large as this
-    displacement, apart from noise.
+    """Project `y1` onto the constraints. The error estimate becomes at least as large as the displacement by
+    the projection, apart from noise.
     """
     free = w.room(form.y)
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
-    # 16 eps over the square of the sine counts as noise
+    # near a loss of rank, 16 eps divided by the square of the sine counts as noise
     amplified = (
         None
         if rank is None
@@ -376,8 +377,8 @@ def project(
 
 
 def norm(w: StepWriter, form: Form, p: Lanes, error: Number, y1: Number) -> Number:
-    """Return the root mean square of the errors of coordinates and speeds, relative to the
-    tolerance; infinite if one is NaN.
+    """Return the root mean square of the errors of coordinates and speeds, relative to the tolerance;
+    infinite if an error is NaN.
     """
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
 

@@ -1,11 +1,11 @@
-"""Steps by Taylor series: coefficients of a state along its motion, their radius, and the
-state at any time within it.
+"""Steps by Taylor series: coefficients of the state along its motion, the permitted length of a step, and the
+state at any time within a step.
 
     y(t + s) = sum_{k=0}^p y_k s^k
     h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
 
-so that neither of the last two terms of a step exceeds the tolerance. The coefficients of y' = f(y)
-are written out order by order:
+so that neither of the last two terms of the series exceeds the tolerance. The coefficients of y' = f(y) are
+computed order by order, without loops:
 
     y_{k+1} = f_k/(k + 1)                                  x_k = x^(k)/k! of any number x along the solution
     (a b)_k = sum_{j=0}^k a_j b_{k-j}
@@ -14,7 +14,7 @@ are written out order by order:
     c = a^e:       c_k = sum_{j=1}^k (e j/k - (k - j)/k) a_j c_{k-j}/a_0             (a constant exponent e)
     c = F(a, ..):  c_k = sum_{j=1}^k (j/k) a_j (dF/da)_{k-j} + ..                     (dF/da: by the graph)
 
-Sums add the newest coefficients last, because all others are known long before. Source: A. Jorba and M. Zou,
+Sums add the newest coefficients last, because all others are known much earlier. Source: A. Jorba and M. Zou,
 Experimental Mathematics 14 (2005) 99, sections 2 and 3.
 """
 
@@ -41,7 +41,7 @@ Coefficients = list[Value]
 
 
 def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
-    """Return why a series of the outputs cannot be written; empty if it can."""
+    """Return why there is no Taylor series of the outputs; empty if there is one."""
     for node in graph.reachable(outputs):
         op = graph.op[node]
         if op in ("const", "input"):
@@ -54,10 +54,10 @@ def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
 
 
 class Series:
-    """Coefficients of all numbers of a graph along a solution, as nodes of the same graph.
+    """Taylor coefficients of the nodes of a graph along a solution, as nodes of the same graph.
 
-    **Arguments:** `known`, the nodes of constant values; `states` and `rates`, the nodes of the state and its
-    rates; `order`, the last coefficient of the state; `clock`, the node of time.
+    **Arguments:** `known`: nodes that are constant along the solution; `states` and `rates`: nodes of the
+    state and of its rates; `order`: index of the last coefficient of the state; `clock`: node of time.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class Series:
                 series.append(graph.div(self._at(rate, k), graph.const(k + 1)))
 
     def _at(self, node: int, k: int) -> int:
-        """Return coefficient k of a node; beyond the known coefficients of an input it is zero."""
+        """Return coefficient k of a node. Inputs have zero coefficients beyond those given."""
         return self.of[node][k] if k < len(self.of[node]) else self.graph.zero
 
     def _with_derivatives(self, nodes: Sequence[int], given: set[int]) -> list[int]:
-        """Return the nodes in order, including the derivatives that their recurrences need."""
+        """Return the nodes and the derivatives that their recurrences need, in order of evaluation."""
         graph, found, left = self.graph, set(nodes), list(nodes)
         while left:
             node = left.pop()
@@ -143,21 +143,22 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """Return the indices j ordered so that products a_j b_{k-j} whose factors become known last come last."""
+    """Sort the indices j by the time at which both factors of a_j b_{k-j} are known."""
     return sorted(js, key=lambda j: max(j, k - j))
 
 
-# a sum of products: varying factors, in order, and their constant coefficient
+# a sum of products: for each product its varying factors, sorted, and its constant coefficient
 Terms = list[tuple[tuple[int, ...], int]]
 
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
-    """Return nodes of the same values, to round-off, with fewer products of varying factors: every
+    """Return nodes with the same values, to round-off, and fewer products of varying factors, because each
     coefficient of a product costs a sum. `moving`: varying inputs.
 
-    Sums and products are expanded into terms. Then the sharing that saves most products is applied
-    repeatedly: x y if several terms contain it, and x y + x z = x (y + z) in one sum. Accelerations of a disc
-    with s, c = sin, cos of its lean take 12 products, and then 7, with p = v w/c and q = c u:
+    Sums and products are expanded into terms. Then the sharing that saves the most products is applied
+    repeatedly: x y is computed once if several terms contain it, and x y + x z = x (y + z) within a sum. For
+    example, the accelerations of a disc, with s, c = sin, cos of its lean, take 12 products at first, and 7
+    with p = v w/c and q = c u:
 
            v (2 s w/c - 5/3 c u),   s (g + c u^2) + 6/5 c u w,   -2 v w/c
         -> 2 s p - 5/3 v q,         g s + q (s u + 6/5 w),       -2 p
@@ -167,7 +168,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     uses = Counter(a for n in nodes for a in graph.args[n])
     whole = {*outputs, *(a for n in nodes if graph.op[n] not in (*signs, "mul") for a in graph.args[n])}
     forms: dict[int, Terms] = {n: [((n,), one)] for n in moving}
-    sums: dict[int, Terms] = {}  # sums that are factors or requested; new ones have negative keys
+    sums: dict[int, Terms] = {}  # sums that are factors or outputs; new sums have negative keys
 
     def named(n: int) -> Terms:
         sums[n] = forms[n]
@@ -232,7 +233,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
             new[n] = graph.again(n, map(node, graph.args[n])) if n in forms and graph.args[n] else n
         return new[n]
 
-    for n in nodes:  # arguments first, to avoid deep recursion
+    for n in nodes:  # in order of dependence, to avoid deep recursion
         node(n)
     return list(map(node, outputs))
 
@@ -243,18 +244,18 @@ def _without(factors: tuple[int, ...], *some: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class TaylorSteps:
-    """Taylor series up to this order, in place of a tableau."""
+    """Taylor series of this order, used in place of a tableau."""
 
     order: int
 
     @property
     def needed(self) -> int:
-        """Return how many state vectors a step keeps: the coefficients, and the rates at its end."""
+        """Return the number of state vectors that a step stores: coefficients, and the rates at its end."""
         return self.order + 2
 
     @property
     def at_the_end(self) -> int:
-        """Return the index of the slope at the end, relative to the slope at the start."""
+        """Return the index of the rates at the end, relative to that of the rates at the start."""
         return self.order
 
 
@@ -266,8 +267,8 @@ class Monitored(NamedTuple):
 
 
 def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
-    """Return the Taylor series of every integrated number, including tangents, at the time t, and
-    the monitored quantities there.
+    """Return the Taylor series of the state, including tangents, at the time t, and the monitored quantities
+    there.
     """
     y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
@@ -278,7 +279,7 @@ def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[l
     )
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
     nodes = [n for part in (own.values[: len(rates)], *own.tangents, own.values[len(rates) :]) for n in part]
-    # on a fresh graph, because node indices determine the order of evaluation
+    # on a new graph, because node indices determine the order of evaluation
     graph, nodes, inputs = on_its_own(
         own.graph, nodes, [*given, *states, *(n for part in own.states for n in part)]
     )

@@ -1,4 +1,4 @@
-"""Functions of time as inputs, on the scalar graph: substitution into a program, and jumps."""
+"""Functions of time on the scalar graph: substitute them for inputs of a program, and detect their jumps."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -18,12 +18,12 @@ from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.structure.trace import Variables
 
-# limit per function of time; each number is a row of a lane, so use `jj.Sampled` for long tables
+# limit for all functions of time; each number is a row of a lane, so long tables should use `jj.Sampled`
 MOST_NUMBERS = 200
 
 
 def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
-    """Return the program with functions of time substituted, or why that is not possible."""
+    """Return the program with functions of time substituted for inputs, or why that is not possible."""
     if not inputs.programs:
         return program
     return with_functions(
@@ -37,7 +37,7 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
 @lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
     """Return the program with these functions substituted for inputs, or why that is not possible. Their
-    numbers come last among the `fixed` ones.
+    numbers are appended to the `fixed` values of the program.
     """
     numbers = sum(
         math.prod(shape) for function in functions if function is not None for shape in function.shapes
@@ -45,7 +45,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     if numbers > MOST_NUMBERS:
         return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
     if any(program.graph.op[n] in ARRAYS for n in program.fixed):
-        return "the scene keeps parts as calls, and an input is a function of time"
+        return "parts of the scene are JAX calls, and an input is a function of time"
     graph = Graph(keeps_rules=True)
     new = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
     t, known = new[program.traced.t], []
@@ -79,14 +79,13 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         fixed=(*(new[n] for n in program.fixed), *known),
         power=new[program.power],
         **on_it,
-        z=(),  # quantities of saved states are computed from the values of inputs
+        z=(),  # dependent speeds of saved states are computed by the original program
     )
 
 
 def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
-    """Return random times and numbers for functions."""
+    """Return random times and numbers, at which jumps of functions are detected."""
     generator = np.random.default_rng(11)
-    # states used to detect jumps of functions
     return Probes(
         graph,
         {
@@ -109,8 +108,8 @@ def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[l
 
 
 def may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
-    """Return whether a function of time jumps. With `varies`, count only jumps at times that
-    depend on one of these numbers.
+    """Return whether a function of time jumps. `varies`: flags of its numbers; then only jumps count whose
+    times depend on a flagged number.
     """
     graph = Graph(keeps_rules=True)
     try:

@@ -1,12 +1,11 @@
-"""Shifts of a state along its rates by a time, which carry the derivatives of times.
+"""Shift a state along its rates by a time, to give it derivatives with respect to times.
 
-Times may have derivatives. Machine code integrates between fixed times, and states are then shifted along
-their rates to the differentiable times. Let z be the state and all arguments of its rates, and G the rate of
-z. Shifting z by a time d of value zero,
+Machine code integrates between constant times. The start is shifted along its rates from the differentiable
+time t_0 to a constant time, t_0 - d, and the results are shifted back to differentiable times. Let z be the
+state and all arguments of its rates, and G the rate of z. A shift of z by a time d, whose value is zero, has
+the derivative
 
     dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to second order
-
-The start is shifted to its fixed time, t_0 - d, the results are shifted forward.
 """
 
 from collections.abc import Callable
@@ -26,8 +25,8 @@ Unknowns = Float[Array, "z"]
 
 
 def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return a function of z and a time displacement that shifts z along its `rates`. The value of the
-    displacement is zero: it only carries derivatives.
+    """Return a function of z and a time d that shifts z along its `rates` by d. The value of d is zero: it
+    only carries derivatives.
     """
 
     def moving_with_time(slope: Callable) -> Callable:
@@ -59,8 +58,8 @@ def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar],
 
 
 def rates_of_all(form: Form) -> Callable[[Unknowns], Unknowns]:
-    """Return the rates of z, which holds the state, time, the known numbers, and the slopes of samples. Rates
-    of the known numbers are zero.
+    """Return the rates of z, which consists of the state, time, the known numbers, and the slopes of sampled
+    inputs. The rates of known numbers are zero.
     """
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
@@ -74,7 +73,7 @@ def rates_of_all(form: Form) -> Callable[[Unknowns], Unknowns]:
 
 @jax.custom_jvp
 def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
-    """Return the product, which is zero for a zero factor `by`, whatever the slope."""
+    """Return the product `slope * by`; zero if `by` is zero, even if the slope is not finite."""
     return jnp.where(by == 0.0, 0.0, slope * by)
 
 

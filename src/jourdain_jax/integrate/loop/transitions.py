@@ -1,20 +1,20 @@
-"""Events at which a motion continues: the state and modes afterwards, and derivatives through them.
+"""Events after which a motion continues: the state and modes afterwards, and derivatives through the event.
 
     z+ = R(t_e, z-, p),   c(t_e, z-, p) = 0        f, f+: rates before and after
 
-The time of the event varies with the state and the numbers p. At a fixed time,
-tangents and cotangents pass it by
+The time of the event varies with the state and the numbers p. Tangents and cotangents at a fixed time change
+at the event by
 
     dt_e = -(c_z dz + c_p dp)/cdot,   cdot = c_t + c_z f
     dz+ = R_z (dz + f dt_e) + R_t dt_e + R_p dp - f+ dt_e
     s = (g.(f+ - R_z f - R_t) - g_t)/cdot,   G = R_z' g + s c_z,   G_p += R_p' g + s c_p
 
-where g_t is the cotangent of t_e. A state with a tangent is again the state of a motion, whose reset
-consists of R and the equation for dz+. Second derivatives therefore follow from the same formulas, the
-saltation matrix of hybrid systems.
+where g_t is the cotangent of t_e (for tangents, this is the saltation matrix of hybrid systems). A state with
+a tangent is again the state of a motion, whose reset consists of R and the equation for dz+. Second
+derivatives therefore follow from the same formulas.
 
-Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and Applied
-Mathematics 11 (1958) 433-447.
+Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and Applied Mathematics 11 (1958)
+433-447.
 """
 
 import math
@@ -30,16 +30,16 @@ from jourdain_jax.kernels.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList
 
-RESTS = 1e-3  # fraction of the absolute tolerance of states: far below errors of steps, above round-off
+RESTS = 1e-3  # fraction of the absolute tolerance: far below errors of steps, and above round-off
 
 
 class Reset(NamedTuple):
-    """State with its tangents after an event, on a separate graph."""
+    """State after an event, with its tangents, as nodes of a separate graph."""
 
-    own: Outputs  # without values
-    event: int  # input: index of the event
-    work: NodeList  # inputs: the work and its tangents; empty if not integrated
-    state: NodeList  # state after it, with its tangents
+    own: Outputs  # variables and tangents; without values
+    event: int  # input node: index of the event
+    work: NodeList  # input nodes: the work and its tangents; empty if work is not integrated
+    state: NodeList  # state after the event, with its tangents
     modes: NodeList
     lost: int  # loss of energy
     times: NodeList  # time of the event, with its tangents
@@ -78,7 +78,7 @@ def reset_program(form: Form) -> Reset:
     energy = graph.add(T, V)
     lost = graph.sub(energy, *graph.substituted([energy], kept)) if form.transitions else graph.zero
     state, modes_after, times = after[: form.q_and_v], after[form.q_and_v : -1], [t]
-    # each followed by its tangents, as many as computed so far
+    # each list is extended below by the tangents, direction by direction
     work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
@@ -88,7 +88,7 @@ def reset_program(form: Form) -> Reset:
         for k, moving in enumerate(form.moving)
     ]
     z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
-    # the energy stored in loads is added at saved times
+    # integrated work excludes energy stored in loads, which is added at saved times
     state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]
     while (parts := len(state) // form.y) <= count:
         before = [n for part in z[:parts] for n in part]
@@ -120,8 +120,8 @@ def reset_program(form: Form) -> Reset:
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:
-    """Write `reset(state, tau, y, event, after)`: the state after an event at the state `y`; rows as
-    in `Form.rows_of_transition`.
+    """Write `reset(state, tau, y, event, after)`, which stores the state after an event that happens at the
+    state `y`. Rows are as in `Form.rows_of_transition`.
     """
     reset = reset_program(form)
     with w.procedure("reset", "state tau:real y event:real after") as (state, tau, y, event, after):
@@ -132,8 +132,9 @@ def write_reset(w: MachineWriter, form: Form) -> None:
 
 
 def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
-    """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`; `g`: cotangents of the state, then of the
-    times. The cotangent of time follows the requested numbers.
+    """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`, which pulls cotangents back through a
+    reset. `g`: cotangents of the state, then of the times. In `to_known`, the cotangent of time follows those
+    of the requested numbers.
     """
     reset, each = reset_program(form), form.y
     graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
@@ -195,12 +196,14 @@ def is_side(w: StepWriter, form: Form, event: Number) -> Number:
 
 
 def is_noted(w: StepWriter, form: Form, left: Number) -> Number:
-    """Return whether a transition in a trial step (`left`) is recorded; transitions of relations are not."""
+    """Return whether the transition `left` of a trial step is recorded. Transitions of relations are not
+    recorded.
+    """
     return w.differs(left, 0.0) & ~is_side(w, form, w.magnitude(left) - 1.0)
 
 
 def slowest(w: StepWriter, p: Lanes) -> Number:
-    """Return the largest change over the whole motion for which a number still counts as resting."""
+    """Return the largest change over the whole motion for which a number still counts as being at rest."""
     return w.larger(RESTS * p["atol"], w.eps)
 
 
@@ -212,20 +215,21 @@ def is_left(w: StepWriter, c: Number, rate: Number, noise: Number) -> Number:
 class Happened(NamedTuple):
     """Event after which lanes continue."""
 
-    event: Number
+    event: Number  # index
     t: Number
-    flat: Number  # whether its value has no slope
-    quiet: Number  # whether it is a relation whose number practically rests: it changes nothing
-    here: Number  # lanes to which it applies
-    noise: Number  # time in which a value rises by round-off
-    found: Number  # whether it was located by a search
+    flat: Number  # whether its value has zero slope
+    quiet: Number  # whether it has no effect, because it belongs to a relation whose number is at rest
+    here: Number  # lanes in which it happened
+    noise: Number  # time in which a value rises by its round-off
+    found: Number  # whether a search located it
 
 
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
-    """Store the state after an event in `y1`; record the event, and the state before.
+    """Store the state after an event in `y1`, and record the event and the state before.
 
-    `stuck` becomes the code of a motion that cannot continue: the event's value rises afterwards so slowly
-    that round-off hides it, a mode is negative, or a relation would turn back at once.
+    If a motion cannot continue, its code is stored in `stuck`: the event's value rises afterwards so slowly
+    that round-off hides it, a mode is negative (a code for failed contacts), or a relation would change back
+    at once.
     """
     event, t, flat, quiet, switches, noise, found = happened
     side = is_side(w, form, event)
@@ -265,7 +269,7 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        # a bounce: the value itself does not jump
+        # `slow` is for bounces only, at which the value itself does not jump
         slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))
         w.store(w.where(slow, float(result_codes.TOO_MANY_TRANSITIONS), w.load(stuck)), stuck)
         left_now = switches & is_left(w, c, rate, noise)
@@ -297,10 +301,11 @@ def reset_back(
     g: Number,
     by_known: Number,
 ) -> None:
-    """Turn cotangents after a transition into cotangents before it, and restore the modes, in lanes where the
-    transition ended a phase (`left`).
+    """Pull cotangents back through a transition, and restore the modes before it, in lanes where `left`
+    states a transition.
 
-    `left`: the rows of this name; `g_t`: cotangents of the transition's time and of its tangents.
+    `left`: pointer to the rows with this name; `g_t`: cotangents of the transition's time and of its
+    tangents.
     """
     count, of = form.integrated, form.rows_of_transition
     mark, t, z, before = w.load(left), w.load(left, 1), w.at(left, 2), w.at(left, 2 + count)

@@ -1,18 +1,18 @@
-"""Modules of LLVM IR as functions of JAX; with them, values of graph nodes and quantities
-outside the steps of a motion.
+"""Call LLVM modules as JAX functions, to compute values of graph nodes and the quantities of a motion that
+are needed outside its steps.
 
-Arguments have no batch axis; under `vmap` the whole batch goes to one call. Many lanes run in
-the widest registers; a single one runs in narrow registers, whose instructions are faster.
-Results do not depend on the width.
+Arguments have no batch axis; under `vmap`, one call computes the whole batch. A batch runs in the widest
+registers, a single sample in narrow registers, whose instructions are faster. Results do not depend on the
+width.
 
     o = f(x),   f'(x) v,   g f'(x),   f''(x) w v,   g f''(x) v          o: values of nodes, x: of variables
 
-Each of these is separate machine code, compiled on request; the derivatives are taken on the graph. For
-programs that are too large, JAX differentiates the program run by XLA.
+Each of these expressions is separate machine code, compiled when it is needed; derivatives are computed on
+the graph. If a program is too large, JAX differentiates the program as run by XLA.
 
 Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies
-at saved states. Machine code saves XLA's tracing and compilation. XLA computes derivatives of speeds of few
-operations (`lowering/lowered_equations.py`).
+at saved states. Machine code avoids XLA's tracing and compilation. Only if speeds have few operations, XLA
+computes their derivatives (`lowering/lowered_equations.py`).
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -60,12 +60,13 @@ def called(
     constant: Mapping[int, tuple[float, ...]] = MappingProxyType({}),
     counted: bool = False,
 ) -> Callable:
-    """Return a module of LLVM IR as a function of arrays without batch axis; `shapes`: function from
-    arguments to the shapes of results.
+    """Return an LLVM module as a function of arrays without batch axis. `write`: writes the module; `shapes`:
+    function from arguments to the shapes of results; `effort`: as for `host.object_code`.
 
-    The first arguments are samples, which lanes may share; `effort`: as for `host.object_code`. The next one
-    holds vectors and numbers, which are rows of a start; `constant`: its other rows. `counted`: whether the
-    last argument is the number of trial steps, by which a GPU sizes the record.
+    The first `of_samples` arguments belong to sampled inputs, and lanes may share them. The next argument is
+    a sequence of vectors and numbers, the rows of a start; `constant`: its rows that are not passed.
+    `counted`: the last argument is the number of trial steps, which determines the size of the record on a
+    GPU.
     """
 
     @cache
@@ -96,8 +97,8 @@ def called(
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
-        # 2 lanes for a single motion; measured: 64 us with 2, 66 with 1 or 4, 99 with
-        # 8 (10 s of a disc at 1e-8)
+        # 2 lanes for a single motion. Measured for 10 s of a disc at 1e-8: 64 us with 2 lanes, 66 with 1 or
+        # 4, 99 with 8
         return call(2, 1, (), tuple(map(jnp.ndim, jax.tree.leaves(arguments))), arguments)
 
     @run.def_vmap
@@ -118,7 +119,7 @@ def _results(*arguments, shapes: Callable, operands: Operands, **_) -> list:
 
 
 def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
-    """Return the call with one more leading batch axis; operands without batch axes stay so."""
+    """Return the call with one more leading batch axis. Operands without any batch axis do not get one."""
     count, every = lanes_of(values, axes), []
     for x, axis, rank in zip(values, axes, operands.ranks, strict=True):
         has_lanes = x.ndim - (axis is not None) > rank
@@ -133,7 +134,7 @@ def _more_lanes(values, axes, operands: Operands, **how) -> tuple[list, list]:
 def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
-    """Return the operands that `make` computes from those of a call, and the context of the new call."""
+    """Apply `make` to the operands of a call. Return the context of the new call, and its operands."""
     made = jax.make_jaxpr(make)(*ctx.avals_in)
     lower = mlir.lower_fun(jaxpr_as_fun(made))
     return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)
@@ -148,14 +149,14 @@ def on_cpu(
     operands: Operands,
     **_,
 ):
-    """Return the call in a program for the CPU."""
+    """Lower the call in a program for a CPU."""
     _check_here(ctx)
     ctx, arguments = _made(ctx, values, operands.side_by_side)
     return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
 
 
 def _on_nvidia(ctx: mlir.LoweringRuleContext, *values, kernel: Callable, operands: Operands, **_):
-    """Return the call in a program for an NVIDIA GPU."""
+    """Lower the call in a program for an NVIDIA GPU."""
     _check_here(ctx)
     if reason := nvidia.reason_against():
         raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
@@ -165,20 +166,19 @@ def _on_nvidia(ctx: mlir.LoweringRuleContext, *values, kernel: Callable, operand
 
 
 def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
-    """Raise the error for programs on any other device."""
+    """Raise OtherDeviceError in programs for any other device."""
     raise OtherDeviceError(f"for JAX's platforms {', '.join(ctx.module_context.platforms)}")
 
 
 def _check_here(ctx: mlir.LoweringRuleContext) -> None:
-    """Raise an error for a program that may run in another process."""
+    """Raise OtherDeviceError in a program that is exported or for several platforms."""
     if ctx.module_context.lowering_parameters.for_export:
         raise OtherDeviceError("to be exported")
     if len(ctx.module_context.platforms) > 1:
         _nowhere(ctx)
 
 
-# The call itself: machine code is compiled when a program that contains it is lowered,
-# not when it is only traced.
+# machine code is compiled when a program that contains this primitive is lowered, not when it is traced
 _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
 _HOW = "handler", "kernel", "lanes", "threads", "shapes", "operands"
@@ -193,8 +193,9 @@ batching.primitive_batchers[_call_p] = _more_lanes
 def nodes_called(
     graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1, moved: Collection[int] = ()
 ) -> Callable[..., Array]:
-    """Return values of nodes of a graph as a function of the values of the variables, in one or more vectors
-    and numbers. If variables are `moved`, two more are rtol and atol, and values at the state `off` follow.
+    """Return a function from values of variables, in vectors and numbers, to values of nodes, by machine
+    code. If variables are `moved`, two more arguments are rtol and atol, and the values at the state `off`
+    follow.
     """
     states = 2 if moved else 1
 
@@ -213,8 +214,8 @@ def nodes_called(
 
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
-    """Return values of nodes as a function of the values of the variables, like `nodes_called`. Structural
-    zeros cost nothing.
+    """Return a function like that of `nodes_called`, with derivatives. Nodes that are structurally zero cost
+    nothing.
     """
     graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
@@ -223,7 +224,7 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
     @cache
     def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
         """Return the derivative as a function of the concatenation of x, v or g, and w; None if it is too
-        large or without machine code.
+        large or cannot be compiled to machine code.
         """
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
@@ -246,8 +247,8 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
     def linear(back: bool) -> Callable[[Array, Array], Array]:
-        """Return a function of x and v, or with `back` of x and g; its derivative along x
-        is machine code if possible.
+        """Return the Jacobian-vector product as a function of x and v, or, with `back`, the vector-Jacobian
+        product as a function of x and g. Its derivative along x is machine code if possible.
         """
 
         def taken(v):
@@ -284,9 +285,8 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Return values of nodes as a function of the values of the variables, by XLA and by
-    machine code. Machine code returns only the nonzero numbers, because the whole matrix of 32
-    trailers would not fit on its stack.
+    """Return two functions from values of variables to values of nodes, by XLA and by machine code. Machine
+    code returns only nonzero nodes, because the whole matrix of 32 trailers would not fit on its stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
@@ -308,22 +308,24 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Machine code for quantities outside the steps of a program: functions of fixed values, time,
+    """Machine code for quantities outside the steps of a motion, as functions of fixed values, time,
     coordinates, independent speeds and inputs.
     """
 
     program: Lowered
-    needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
-    fixed: Callable[[Array], Array]  # function of those entries
-    speeds: Callable[..., Array]  # all speeds, for their derivatives
+    needed: tuple[
+        Indices, ...
+    ]  # nodes of the parameters' entries on which fixed values depend; -1 for others
+    fixed: Callable[[Array], Array]  # fixed values from these entries
+    speeds: Callable[..., Array]  # all speeds, with derivatives
     numbers: Callable[..., Array]  # all speeds and pivots, without derivatives
-    energies: Callable[..., Array]  # at a state, then at the state `off` it; without derivatives
+    energies: Callable[..., Array]  # energies at a state, then with `off` applied to it; without derivatives
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
     def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
         """Return the values of `Lowered.fixed_values`."""
         parameters = entries(scene, self.needed)
-        if not self.program.fixed or not parameters:  # nothing to pass, or nothing requested
+        if not self.program.fixed or not parameters:  # no fixed values, or none that depends on parameters
             return self.program.fixed_values(scene)
         return entries_of(self.fixed(*parameters))
 
@@ -336,7 +338,7 @@ class Beside:
 
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
-    """Return the machine code outside the steps of a program; None if it cannot be compiled."""
+    """Return the machine code for quantities outside the steps; None if it cannot be compiled."""
     graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
     # limit of 60_000 operations
     if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
@@ -351,8 +353,9 @@ def beside(program: Lowered) -> Beside | None:
     numbers = _at_state(program, [*u, *program.pivots], nodes_called)
     state = {*program.traced.q.tolist(), *(int(program.traced.u[k]) for k in program.independent)}
     energies = _at_state(program, program.energies, partial(nodes_called, moved=state))
-    # Derivatives of speeds are machine code from 100 operations. Gradients, ms by XLA and here: 256 bicycles
-    # (460 operations) 85 and 72, 1,024 chains of 4 trailers (124) 111 and 108, 256 rattlebacks (70) 29, 42.
+    # From 100 operations on, derivatives of speeds are machine code. Times of gradients in ms, by XLA and by
+    # machine code: 256 bicycles (460 operations) 85 and 72; 1,024 chains of 4 trailers (124) 111 and 108; 256
+    # rattlebacks (70) 29 and 42.
     return Beside(
         program,
         needed,
@@ -365,7 +368,7 @@ def beside(program: Lowered) -> Beside | None:
 
 
 def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
-    """Return machine code of nodes, which takes only the fixed numbers that it needs."""
+    """Return `function` of these nodes, which passes only those fixed values on which the nodes depend."""
     used = set(program.graph.reachable(nodes))
     which = [k for k, n in enumerate(program.fixed) if n in used]
     run = function(
@@ -375,8 +378,8 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
-    """Return the entries of a scene's parameters that have a node; `nodes`: the node of each
-    entry of each leaf, -1 for none.
+    """Return the entries of a scene's parameters that have a node, as flat arrays. `nodes`: for each leaf the
+    node of each entry, -1 for none.
     """
     found = []
     for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
@@ -388,7 +391,7 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 
 def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
-    """Return whether parameters, and the bodies and contacts that depend on them, are valid as defined by
+    """Return whether the parameters, bodies and contacts of a scene are valid, as checked by
     `parameter_faults` and `faults_at`.
     """
     parts = [*entries(scene, program.parameters), t, q, u, inputs, others]

@@ -1,3 +1,3 @@
-"""The integrated rates: one `VectorField` in three forms, by a scalar program, or by dense matrices in the
-minimal or the full state. Open `field.py` first.
+"""The rates that are integrated: a `VectorField` by a scalar program, or by dense matrices with the minimal
+or the full state. Open `field.py` first.
 """

@@ -1,5 +1,5 @@
-"""Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a
-program, and for reductions chosen by the user.
+"""Rates by dense matrices that JAX differentiates, with the minimal or the full state. They serve scenes
+without a scalar program, and reductions chosen by the user.
 """
 
 import equinox as eqx
@@ -31,18 +31,20 @@ from jourdain_jax.structure.structure import closure_lengths, structure_whatever
 
 
 class UsualLengths(eqx.Module):
-    """Usual lengths of constraint rows in scaled speeds, with their rank, and of geometric constraints and
-    quaternion norms in the coordinates.
+    """Typical lengths of matrix rows: of velocity constraints in scaled speeds (with their rank), and of
+    geometric constraints and quaternion norms in the coordinates.
     """
 
     rows: UsualRows
     closures: Float[Array, "closures"]
-    own_speeds: Float[Array, "own_speeds"]  # of the coordinate rates by each of the scene's own speeds
+    own_speeds: Float[
+        Array, "own_speeds"
+    ]  # size of the coordinate rates due to each of the scene's own speeds
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:
-    """Return the usual lengths for the parameters of `scene`, without derivatives."""
-    with jax.ensure_compile_time_eval():  # cached between calls, whether inside `jit` or not
+    """Return the typical lengths for the parameters of `scene`. They have no derivatives."""
+    with jax.ensure_compile_time_eval():  # the results are cached, so they must be concrete also inside `jit`
         own_speeds = _of_own_speeds(scene)
         if not is_traced(scene):
             return UsualLengths(
@@ -52,8 +54,8 @@ def usual_lengths(scene: Scene) -> UsualLengths:
 
 
 def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
-    """Return lengths at states probed with numbers near the class's defaults. They are
-    computed while the motion runs.
+    """Return the lengths for traced parameters, at states that were probed with parameters near the class's
+    defaults. They are computed in the program of the motion.
     """
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(12, known.random)
@@ -75,14 +77,15 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
 
 
 def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """Return the median over states, or the largest value if half of the values are zero, ignoring NaN."""
+    """Return the median over states, or the largest value if the median is zero. NaN is ignored."""
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """Return the size of the coordinate rates by each own speed, the median over probed states. A rate counts
-    as infinite far above this size, which is a thousand times larger for traced parameters.
+    """Return the size of the coordinate rates due to each of the scene's own speeds, as the median over
+    probed states (a thousand times larger for traced parameters). A rate far above this size counts as
+    infinite.
     """
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
@@ -93,15 +96,15 @@ def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
 
 
 class ByMatrices(VectorField):
-    """Shared parts of both states."""
+    """Base class of the minimal and the full state by dense matrices."""
 
     stabilisation: Baumgarte | None
     usual: UsualLengths  # of the constraints
     # whether constraints depend on inputs that change with time, so that rates of inputs are needed
     inputs_in_rows: bool = static()
-    # all constraints, if some are nonlinear in the speeds and none is redundant
+    # indices of all constraints, if some are nonlinear in the speeds and none is redundant; otherwise empty
     nonlinear_rows: Indices = static()
-    # singular values below it count as zero when speeds are projected; None: round-off
+    # singular values below the cutoff count as zero when speeds are projected; None: round-off
     cutoff: float | None = static()
 
     def now(self, inputs, t):
@@ -109,8 +112,8 @@ class ByMatrices(VectorField):
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, at: Instant, u) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
-        """Return the motion with these speeds, its accelerations, and the eliminated constraints that
-        are nonlinear in the speeds.
+        """Return the motion with the speeds u, its accelerations, and the directions of the constraints
+        `nonlinear_rows`, each orthogonal to the earlier ones.
         """
         state = at.scene, at.t, at.y.q, u, at.inputs
         found, equations, rows = reduced_at(*state, self.reduction, self.stabilisation, self.usual.rows)
@@ -121,8 +124,8 @@ class ByMatrices(VectorField):
         )
 
     def watched(self, at: Instant, motion: Motion, found: Reduced, v, pivots, rows) -> Watched:
-        """Add the coordinate rates by each of the scene's own speeds, which must stay finite, to these
-        rates, pivots and constraints.
+        """Return rates, pivots and directions. Coordinate rates due to the scene's own speeds, which must
+        stay finite, are added to the pivots and to the directions `rows`.
         """
         power = rate_of_work(at.scene, motion, found, self.of_inputs) if self.with_work else None
         N = jax.lax.stop_gradient(rates_by_own_speeds(at.scene, at.t, at.y.q))
@@ -148,7 +151,7 @@ class ByMatrices(VectorField):
 
 
 class MinimalByMatrices(ByMatrices):
-    """State of coordinates and independent speeds."""
+    """Minimal state: coordinates and independent speeds."""
 
     independent: Indices = static()
     rows: Indices = static()  # constraints that determine the dependent speeds
@@ -167,7 +170,7 @@ class MinimalByMatrices(ByMatrices):
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates` and the sign of det A_z."""
+        """Return the rates and, as a pivot, the sign of det A_z."""
         known = self._kinematics(at)
         own = (
             isinstance(self.reduction, Privileged)
@@ -189,10 +192,10 @@ class MinimalByMatrices(ByMatrices):
 
 
 class FullByMatrices(ByMatrices):
-    """State of coordinates and all speeds."""
+    """Full state: coordinates and all speeds."""
 
-    # relative size of rows below which round-off decides between branches that cross at a loss
-    # of rank; None: no branches
+    # pivot below which round-off decides between branches of motion that cross at a loss of rank; None: no
+    # branches
     undecided: float | None = static()
     own_equations: str = static(default="")  # equations that a solver uses instead of accelerations
 
@@ -211,12 +214,14 @@ class FullByMatrices(ByMatrices):
 
     @property
     def has_pivots(self) -> bool:
-        """Return whether round-off might decide on which branch a motion continues."""
+        """Return whether the motion might change to another branch, so that pivots or directions are
+        monitored.
+        """
         return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
     @property
     def near_rank_loss(self) -> bool:
-        """Return whether branches may cross on the constraints onto which a step is projected."""
+        """Return whether steps are projected onto constraints at which branches of motion may cross."""
         return self.projects and self.undecided is not None
 
     def speeds(self, at: Instant) -> Speeds:
@@ -229,8 +234,8 @@ class FullByMatrices(ByMatrices):
         return at.y.v, found.pivot
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, eliminated constraints, and 1 if the constraints determine the branch of the
-        motion, or -1 if round-off does.
+        """Return the rates, directions of constraints, and as a pivot 1 if the constraints determine the
+        branch of the motion, -1 if round-off does.
         """
         motion, found, directions = self.solved(at, at.y.v)
         branch = (
@@ -243,14 +248,14 @@ class FullByMatrices(ByMatrices):
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
-    """Return the part of each row that is orthogonal to the earlier ones."""
+    """Return the component of each row that is orthogonal to the earlier rows."""
     Q, R = jnp.linalg.qr(jax.lax.stop_gradient(A).T)
     return (Q * jnp.diagonal(R)).T
 
 
 def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
-    """Return the full state in place of another form, for a solver that satisfies the
-    constraints by `own_equations`.
+    """Return the field with the full state and without projection, for a solver that satisfies the
+    constraints by its `own_equations`.
     """
     return FullByMatrices(
         independent=None,

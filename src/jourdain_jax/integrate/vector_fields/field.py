@@ -38,11 +38,11 @@ _STATES = ("auto", "minimal", "full")
 
 
 class Formulation(eqx.Module):
-    """The equations that `simulate` integrates. The default is chosen for the scene.
+    """Form of the equations that `simulate` integrates. The default is chosen for the scene.
 
     - `state`: "minimal", coordinates q and independent speeds y; "full", coordinates and all speeds u; "auto"
-      (default), the minimal one if the independent speeds are well conditioned over the scene's domain and
-      the constraints are linear or affine.
+      (default), the minimal state if the independent speeds are well conditioned over the scene's domain and
+      the constraints are linear or affine, otherwise the full state.
     - `reduction`: method for the accelerations, a name or an object as in `accelerations` (default: the
       scene's scalar program if there is one).
     - `stabilisation`: method to satisfy constraints that the integrated state does not satisfy by
@@ -83,7 +83,7 @@ class Formulation(eqx.Module):
 
     @property
     def baumgarte(self) -> Baumgarte | None:
-        """Return the terms added to the constraints; None without."""
+        """Return Baumgarte's terms, which are added to the constraints, or None."""
         return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
 
 
@@ -91,7 +91,7 @@ _DEFAULT = Formulation()
 
 
 def as_formulation(formulation) -> Formulation:
-    """Return the formulation, or the default for None; raises ValueError for anything else."""
+    """Return the formulation, or the default for None. Raises ValueError for anything else."""
     if formulation is None:
         return _DEFAULT
     check_kind(
@@ -122,27 +122,27 @@ class Integrated(eqx.Module):
         return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
 
     def with_rows(self, rows: Float[Array, "rows *lanes"]) -> "Integrated":
-        """Return a state of as many coordinates and speeds with other values."""
+        """Return a state with the values `rows` and the same numbers of coordinates and speeds."""
         q, v, *work = jnp.split(rows, np.cumsum([len(self.q), len(self.v)]))
         return Integrated(q, v, rows[-1] if len(work[0]) else None)
 
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
-        """Return the state from these rows; `form` gives the numbers of coordinates and speeds."""
+        """Return the state with the values `rows`. `form`: has the numbers of coordinates and speeds."""
         n, end = form.coordinates, form.q_and_v
         return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
 
 
 class Watched(NamedTuple):
-    """Rates; pivots that must keep their signs; directions of constraints nonlinear in the speeds, which must
-    not reverse; and a sine that is small near a loss of rank.
+    """Rates and monitored quantities: pivots, which must keep their signs; directions of constraints that are
+    nonlinear in the speeds, which must not reverse; and a sine that is small near a loss of rank.
     """
 
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
     directions: Float[Array, "rows speeds *lanes"]
-    # smallest sine between a constraint and the earlier ones; None if constraints are solved
-    # for speeds, or there are none
+    # smallest sine of the angle between a constraint and the earlier ones; None if constraints are
+    # eliminated, or if there are none
     sine: PerLane | None = None
 
 
@@ -150,10 +150,10 @@ class Instant(NamedTuple):
     """Arguments of a vector field."""
 
     scene: Scene
-    fixed: tuple  # the scene's part of the rates, computed once per motion
+    fixed: tuple  # part of the rates that depends on parameters only, computed once per motion
     t: PerLane  # s
     y: Integrated
-    inputs: Any  # values at this time; for `rates` and `rates_and_pivots` from `now`
+    inputs: Any  # values at this time; for `rates` and `rates_and_pivots` the result of `now`
 
     @property
     def of_program(self) -> tuple[tuple, Any, Any, Any, Any]:
@@ -162,15 +162,18 @@ class Instant(NamedTuple):
 
 
 class VectorField(eqx.Module):
-    """Packing, unpacking, rates and projection of a scene's state. All choices are static."""
+    """Interface of the integrated state of a scene: packing, unpacking, rates and projection. All fields are
+    static, except those of the reduction.
+    """
 
-    independent: Indices | None = static()  # independent speeds; None: the full state
+    independent: Indices | None = static()  # indices of the independent speeds; None: the full state
     reduction: Reduction | GibbsAppell
     with_work: bool = static()
     conserves: bool = static()  # T + V is constant along every motion
     projects_positions: bool = static()
     projects_speeds: bool = static()
-    rows_may_contradict: bool = static()  # although the start satisfies all of them (`motion/drift.py`)
+    # whether constraints that the start satisfies may contradict each other later (`motion/drift.py`)
+    rows_may_contradict: bool = static()
     of_inputs: Indices = static()  # indices of loads whose potential depends on inputs
     event_names: Labels = static()  # sorted
     stops: tuple[bool, ...] = static()  # whether each event ends the motion
@@ -192,39 +195,39 @@ class VectorField(eqx.Module):
 
     @property
     def lowers_events(self) -> bool:
-        """Return whether stop events are part of the scalar program."""
+        """Return whether events are part of the scalar program."""
         return False
 
     @property
     def projects(self) -> bool:
-        """Return whether a step projects the state onto constraints."""
+        """Return whether steps project the state onto constraints."""
         return self.projects_positions or self.projects_speeds
 
     @property
     def needs_pivot(self) -> bool:
-        """Return whether a motion ends when a pivot is small or changes its sign. With a full state
-        it continues, with a warning.
+        """Return whether a motion ends when a pivot is small or changes its sign. With the full state by
+        dense matrices it continues, with a warning.
         """
         return True
 
     @property
     @abc.abstractmethod
     def has_pivots(self) -> bool:
-        """Return whether a step is repeated if a pivot changes its sign, because the state or a
-        constraint is lost within it.
+        """Return whether pivots are monitored. A step in which a pivot changes its sign is repeated, because
+        the speeds or a constraint become undetermined within it.
         """
 
     @property
     def near_rank_loss(self) -> bool:
-        """Return whether `rates_and_pivots` reports the distance of the constraints from a loss of rank."""
+        """Return whether `rates_and_pivots` also computes how close the constraints are to a loss of rank."""
         return False
 
     def fixed(self, scene: Scene) -> tuple:
-        """Return the scene's part of the rates, computed once per motion."""
+        """Return the part of the rates that depends on parameters only, computed once per motion."""
         return ()
 
     def now(self, inputs, t):
-        """Return the inputs' part of the rates at a time."""
+        """Return the inputs at a time, in the form that the rates need."""
         return inputs(t)
 
     def pack(self, q, u) -> Integrated:
@@ -233,8 +236,8 @@ class VectorField(eqx.Module):
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def stored(self, scene: Scene, t, q, inputs) -> Scalar:
-        """Return the energy (J) stored in loads whose potential depends on inputs. Integrated work plus the
-        change of this energy is the work done.
+        """Return the energy (J) stored in loads whose potential depends on inputs. The work done is the
+        integrated work plus the change of this energy.
         """
         return stored_by_inputs(
             scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs
@@ -246,10 +249,10 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
-        """Return all speeds, and a measure of how well the independent ones determine the others. The measure
-        changes its sign where they do not.
+        """Return all speeds, and a pivot: a measure of how well the independent speeds determine the others,
+        which changes its sign where they do not.
 
-        For the full state it is the measure of the reduction, without a sign. It is None if nothing is
+        For the full state it is the pivot of the reduction, without a sign. It is None if no speed is
         eliminated.
         """
 
@@ -258,8 +261,8 @@ class VectorField(eqx.Module):
         return motion_at(at.scene, at.t, at.y.q, self.speeds(at), at.inputs)
 
     def events(self, at: Instant) -> Float[Array, "events *lanes"]:
-        """Return values of the stop events, in the order of their names. Batches are
-        supported only if `lowers_events`.
+        """Return the values of the events, in the order of their names. Batches are supported only if
+        `lowers_events`.
         """
         return event_values(at.scene, self.motion(at))
 
@@ -273,13 +276,13 @@ class VectorField(eqx.Module):
         return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
-        """Return the switching contacts at the start of a motion from (q, u):
-        `switching.Begun` as one vector.
+        """Return the switching contacts at the start (q, u) of a motion: the result of `contacts_at_start` as
+        one vector.
         """
         return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
-        """Return the kinetic and potential energy, J, without derivatives."""
+        """Return the kinetic and potential energy (J). They have no derivatives."""
         at = jax.lax.stop_gradient(at)
         return jnp.stack(energies_at(at.scene, self.motion(at)))
 
@@ -289,12 +292,12 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates` with the quantities monitored at all stages of a step."""
+        """Return the rates and the quantities monitored at all stages of a step."""
 
     @abc.abstractmethod
     def project(self, at: Instant) -> Integrated:
-        """Return the state projected onto geometric constraints, quaternion norms and (full
-        state) velocity constraints.
+        """Return the state projected onto geometric constraints, quaternion norms, and, for the full state,
+        velocity constraints.
         """
 
 
@@ -325,19 +328,21 @@ class ByProgram(VectorField):
 
     @property
     def pivots(self) -> int:
-        """Return the number of monitored pivots. With multipliers, only the coordinate rates have pivots."""
+        """Return the number of monitored pivots. With multipliers, only coordinate rates have pivots."""
         if self.independent is None and not self.program.by_partition:
             return self.program.divisors
         return len(self.program.pivots)
 
     @property
     def needs_pivot(self) -> bool:
-        """Return whether a small pivot ends a motion; with multipliers the state stays complete."""
+        """Return whether a small pivot ends a motion. With multipliers it need not, because all speeds are
+        integrated.
+        """
         return self.independent is not None or self.program.by_partition
 
     @property
     def near_rank_loss(self) -> bool:
-        """Return whether constraints are enforced by multipliers and projection."""
+        """Return whether multipliers and projection enforce constraints."""
         return self.projects and bool(self.program.squares)
 
     def fixed(self, scene: Scene) -> tuple:
@@ -371,7 +376,7 @@ class ByProgram(VectorField):
         return super().resets(at)
 
     def rates_and_pivots(self, at: Instant) -> Watched:
-        """Return `rates`, the pivots of the elimination, and the eliminated constraints."""
+        """Return the rates, the pivots of the elimination, and the directions of nonlinear constraints."""
         y = at.y
         qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(
             *at.of_program, self.with_work
