@@ -218,11 +218,11 @@ SENSORS: dict[str, str] = {
         " `x_rate`"
     ),
     "fitted(delay=0.3)": (
-        "`gyro` of run 0 of `Cart` starts at 0.2 s, with a delay of up to 0.3 s: its first samples are of"
-        " times before t0 = 0 s"
+        "`gyro` of run 0 of `Cart` starts at 0.2 s, with a delay of up to 0.3 s: its first samples refer"
+        " to times before t0 = 0 s"
     ),
     "fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5)))": (
-        "give an earlier `t0` with its start, or NaN for these samples"
+        "give an earlier `t0` and its start, or NaN for these samples"
     ),
     "fitted(gain=jj.Estimate(3.0, range=jj.bounds(0.0, 2.0)))": (
         "first guess of `gyro.gain` is 3.0; expected a first guess between its bounds"

@@ -103,8 +103,8 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
             f"channel `{name}` of {where} starts at {first:g} s, with a delay of up to {latest(delay):g} s: "
-            f"its first samples refer to times before t0 = {t0:g} s; give an earlier `t0` and the start "
-            "then, or NaN for these samples"
+            f"its first samples refer to times before t0 = {t0:g} s; give an earlier `t0` and its start, "
+            "or NaN for these samples"
         )
 
 
