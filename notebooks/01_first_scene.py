@@ -15,8 +15,8 @@
 # # A first scene: the Chaplygin sleigh, from description to gradient
 #
 # A sleigh stands on two smooth feet and one blade. The blade can slide along itself and can turn, but it
-# cannot slip sideways. That one condition is a *nonholonomic* constraint: it limits the velocities, yet it
-# does not limit where the sleigh can get to.
+# cannot slip sideways. This condition is a *nonholonomic* constraint: it limits the velocities of the sleigh,
+# but not the places that it can reach.
 #
 # We describe the sleigh in a dozen lines, let the engine derive its equations of motion by Jourdain's
 # principle, compare the motion with Chaplygin's closed form, and differentiate the whole simulation.
@@ -32,9 +32,9 @@ import jourdain_jax as jj
 # %% [markdown]
 # ## Describe it
 #
-# A scene is a class. Its fields are physical parameters, its methods say where the bodies are and what holds
-# them. Velocities, the mass matrix and the constraint's Jacobian are found by automatic differentiation: we
-# never write them.
+# A scene is a class. Its fields are physical parameters; its methods return poses of bodies, loads and
+# constraints. Automatic differentiation provides velocities, the mass matrix and the Jacobian of the
+# constraint.
 
 
 # %%
@@ -63,8 +63,9 @@ sleigh = Sleigh()
 # %% [markdown]
 # ## What kind of system is it?
 #
-# Before simulating, ask. Three speeds, one row, two degrees of freedom; the row is not integrable; and the
-# growth vector (2, 3) says that from two admissible velocities all three coordinates can be reached.
+# A report shows it before the first simulation. Three speeds with one constraint leave two degrees of
+# freedom. The constraint is not integrable: by the growth vector (2, 3), motions along two admissible
+# velocities reach all three coordinates.
 
 # %%
 print(jj.report(sleigh))
@@ -72,8 +73,8 @@ print(jj.report(sleigh))
 # %% [markdown]
 # ## Let it go
 #
-# We give the forward speed of the mass centre, and how fast the sleigh turns. What we do not give (the
-# sideways speed) follows from the blade.
+# We set the forward speed of the mass centre and the turn rate. The sideways speed follows from the
+# constraint of the blade.
 
 # %%
 v0, w0 = -0.6, 0.9
@@ -89,8 +90,8 @@ print(motion)
 #
 # $$ v = V \tanh\tau, \qquad \omega = \frac{V}{k}\,\mathrm{sech}\,\tau . $$
 #
-# The sleigh always ends up going straight ahead, blade behind the mass centre, whichever way it started: it
-# is reversible, energy is conserved, and yet it behaves as if it were damped.
+# From any start, the sleigh ends up going straight ahead, with the blade behind the mass centre. Its
+# equations are reversible and its energy is conserved, and yet it behaves as if it were damped.
 
 # %%
 m, inertia, a = (float(x) for x in (sleigh.mass, sleigh.inertia, sleigh.offset))
@@ -128,9 +129,9 @@ fig.tight_layout()
 # %% [markdown]
 # ## Differentiate the simulation
 #
-# How does the heading at the end depend on where the mass centre lies? The simulation is one JAX function;
-# `jax.grad` goes through it. From $t = -\infty$ to $\infty$ the sleigh turns by $\pi k/a$, so more offset
-# must mean less turning.
+# How does the final heading depend on the position of the mass centre? The simulation is a JAX function,
+# which `jax.grad` differentiates. From $t = -\infty$ to $\infty$ the sleigh turns by $\pi k/a$, so more
+# offset must mean less turning.
 
 
 # %%

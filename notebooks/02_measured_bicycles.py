@@ -14,10 +14,10 @@
 # %% [markdown]
 # # Measured bicycles: at which speeds do they stay upright by themselves?
 #
-# Ten bicycles were taken apart, weighed, balanced and swung, and each of the 26 numbers of the Whipple model
-# was published with its standard deviation. We build the *nonlinear* bicycle (two rolling wheels, front
-# contact found from geometry), linearise it about upright running, find the speeds where it becomes stable
-# and unstable, and carry the measured uncertainties through to these speeds.
+# Ten bicycles were taken apart, weighed, balanced and swung, and the 26 parameters of the Whipple model were
+# published with their standard deviations. We build the *nonlinear* bicycle (two rolling wheels, front
+# contact found from geometry), linearise it about upright running, find the speeds at which it becomes stable
+# and unstable, and compute the uncertainty of these speeds from the measured standard deviations.
 
 # %%
 import jax
@@ -36,9 +36,9 @@ from jourdain_jax.bicycle import (
 # %% [markdown]
 # ## One bicycle
 #
-# The benchmark bicycle of Meijaard, Papadopoulos, Ruina and Schwab (2007) has no uncertainty and published
-# results: stable from 4.29238253634111 to 6.02426201538837 m/s. The linear matrices below come from the
-# nonlinear model by automatic differentiation, not from the published formulas.
+# The benchmark bicycle of Meijaard, Papadopoulos, Ruina and Schwab (2007) has exact parameters. Its published
+# stable range is 4.29238253634111 to 6.02426201538837 m/s. The linear matrices below come from the nonlinear
+# model by automatic differentiation, not from the published formulas.
 
 
 # %%
@@ -57,8 +57,8 @@ assert abs(found.capsize_speed - 6.02426201538837) < 1e-10
 # %% [markdown]
 # ## Measured ones, with their uncertainty
 #
-# 500 bicycles are drawn around each measured one, all sigmas taken as independent (the files carry no
-# covariance), and their speeds found in one batch. The bar holds 95 % of the samples that have the speed.
+# For each measured bicycle, 500 bicycles are drawn with independent errors (the files contain no covariance),
+# and their speeds are computed in one batch. A bar contains 95 % of the samples for which the speed exists.
 
 # %%
 batch = jax.jit(jax.vmap(speeds_of))

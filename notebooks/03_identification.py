@@ -12,11 +12,11 @@
 # ---
 
 # %% [markdown]
-# # Identification with uncertainty: what a sleigh tells about itself
+# # Identification with uncertainty: parameters of a sleigh from its track
 #
-# A Chaplygin sleigh is pushed and filmed. From its noisy track we estimate its inertia and the place of its
-# mass centre, with honest intervals. Then we ask for the mass as well, which the track cannot tell, and see
-# that the engine says so instead of inventing a number.
+# A Chaplygin sleigh is pushed and filmed. From its noisy track we estimate its inertia and the position of
+# its mass centre, with intervals. Then we also free the mass, which the track does not determine, and see how
+# the fit reports this.
 
 # %%
 import jax.numpy as jnp
@@ -28,8 +28,8 @@ import jourdain_jax as jj
 # %% [markdown]
 # ## A noisy measurement
 #
-# Twenty-five positions and headings in six seconds, with 5 mm and 0.01 rad of noise. The truth is known here,
-# so that we can check the answer.
+# The data are twenty-five positions and headings in six seconds, with noise of 5 mm and 0.01 rad. They are
+# simulated, so that we can compare the estimates with the true values.
 
 # %%
 truth = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
@@ -43,9 +43,10 @@ values = {name: np.asarray(motion[name]) + noise.normal(0.0, s, len(ts)) for nam
 data = jj.Experiment(ts, values, sigma, start=push)
 
 # %% [markdown]
-# ## Estimate inertia and offset, the mass being known
+# ## Estimate inertia and offset with known mass
 #
-# Levenberg-Marquardt, with Jacobians by forward-mode differentiation through the simulation.
+# The fit uses the method of Levenberg and Marquardt, with Jacobians by forward-mode differentiation of the
+# simulation.
 
 # %%
 guess = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.2, offset=0.4)
@@ -74,11 +75,11 @@ residuals.legend()
 plt.show()
 
 # %% [markdown]
-# ## Ask too much
+# ## Free too much
 #
-# A track shows lengths and times, no forces: only $(I + m a^2)/m$ and $a$ can be told. With the mass free as
-# well, one combination of mass and inertia stays hidden. It is named, and neither gets an interval; the
-# offset keeps its own.
+# A track shows lengths and times, but no forces, and determines only $(I + m a^2)/m$ and $a$. If the mass is
+# also free, one combination of mass and inertia is not determined. The fit names this combination and gives
+# no interval for mass and inertia; the interval of the offset remains.
 
 # %%
 asked = jj.fit(guess, data, free=("mass", "inertia", "offset"))

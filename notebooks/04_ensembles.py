@@ -14,10 +14,10 @@
 # %% [markdown]
 # # Which discs fall? A study of many motions
 #
-# A disc that rolls fast enough stays up; a slow one falls over. Where the border lies depends on how it is
-# let go. One simulation answers for one start; here we run a hundred thousand, keep what matters of each in a
-# folder that survives a crash, and ask which start value matters most. Then we ask a measured bicycle where
-# it falls, and which of its measurements deserves to be made again.
+# A disc that rolls fast enough stays up; a slow one falls over. The boundary depends on the start. Here we
+# run a hundred thousand motions, store their main results in a folder that survives a crash, and compute
+# which start value matters most. Then we compute where a measured bicycle falls, and which of its
+# measurements should be repeated.
 
 # %%
 import os
@@ -33,11 +33,11 @@ os.chdir(tempfile.mkdtemp())
 disc = jj.models.TiltingDisc()
 
 # %% [markdown]
-# ## Say what varies
+# ## What varies
 #
-# Lean, lean rate and spin are drawn by a Sobol sequence, which fills the space more evenly than random
-# numbers do. Sample k follows from the seed and k alone: the study may be cut into any pieces, stopped and
-# continued, and every number keeps its bits.
+# A Sobol sequence, which fills the space more evenly than random numbers, gives lean, lean rate and spin.
+# Sample k depends only on the seed and k: the study may be divided into any pieces, stopped and continued,
+# and its results have the same bits.
 
 # %%
 start = {"lean": Uniform(-0.6, 0.6), "lean_rate": Normal(0.0, 0.3), "spin_rate": Uniform(-1.5, 0.0)}
@@ -47,8 +47,8 @@ study
 # %% [markdown]
 # ## Run it
 #
-# Of each motion we keep whether the disc fell within two seconds, when, and its largest lean. A fallen disc
-# ends its lane at once, and another takes its place.
+# For each motion we store whether and when the disc fell within two seconds, and its largest lean. A motion
+# stops when the disc has fallen, and the next one takes its place in the batch.
 
 # %%
 outputs = {
@@ -68,8 +68,8 @@ result = study.run("discs.zarr", **asked)
 result
 
 # %% [markdown]
-# The folder is a Zarr store. The same call again computes nothing: all chunks are there, and their checksums
-# hold.
+# The folder is a Zarr store. If the same call is repeated, nothing is computed, because all chunks exist and
+# match their checksums.
 
 # %%
 study.run("discs.zarr", **asked)
@@ -79,7 +79,7 @@ arrays.data_vars
 # %% [markdown]
 # ## Where discs fall
 #
-# The share of discs that fell, over the lean and the spin with which they were let go.
+# The picture shows the fraction of discs that fell, over lean and spin at the start.
 
 # %%
 spin, lean = -arrays["spin_rate_at_start"].values, arrays["lean_at_start"].values
@@ -97,8 +97,8 @@ axes[1].set(xlabel="time of the fall (s)", ylabel="discs")
 axes[1].spines[["top", "right"]].set_visible(False)
 
 # %% [markdown]
-# Slow discs fall, and the more a disc leans, the more spin it needs. The one that fell first, alone, with all
-# there is to know of its motion:
+# Slow discs fall, and the more a disc leans, the more spin it needs. This is the complete motion of the disc
+# that fell first:
 
 # %%
 first = int(np.nanargmin(arrays["fall time"].values))
@@ -109,8 +109,9 @@ print(lane.simulate())
 # %% [markdown]
 # ## What matters most
 #
-# Sobol' indices share out the variance of the largest lean: of first order, what each start value does alone;
-# in total, with all that it does together with others. They need a design of their own, after Saltelli.
+# Sobol' indices divide the variance of the largest lean among the start values. The first-order index of a
+# start value is the part due to this value alone; the total index includes its interactions with others. They
+# need a special design (Saltelli's).
 
 # %%
 indices = (
@@ -143,9 +144,9 @@ axis.spines[["top", "right"]].set_visible(False)
 # %% [markdown]
 # ## Where a bicycle falls
 #
-# The Browser is a Dutch city bicycle that was measured at TU Delft and UC Davis; `measured_bicycle` knows its
-# 25 numbers and their standard deviations. Here it rides on its own for five seconds, from random speeds and
-# leans. (`bench/ensemble_cases.py` does this with a million rides.)
+# The Browser is a Dutch city bicycle that was measured at TU Delft and UC Davis; `measured_bicycle` returns
+# its 25 parameters with their standard deviations. Here it rides without hands for five seconds, from random
+# speeds and leans. (`bench/ensemble_cases.py` does this with a million rides.)
 
 # %%
 from jourdain_jax.bicycle import linear_matrices, measured_bicycle, stability_speeds
@@ -174,15 +175,15 @@ figure.colorbar(mesh, ax=axis, label="share that fell within 5 s")
 axis.set(xlabel="speed at the start (m/s)", ylabel="lean at the start (rad)")
 
 # %% [markdown]
-# Below 3 m/s it falls from any start. Beyond, the lean from which it recovers grows with the speed. The
-# border has steps: a fall lasts longer with each swing of the weave, and what has not fallen by five seconds
-# counts as standing.
+# Below 3 m/s it falls from any start. Above, the lean from which it recovers grows with the speed. The
+# boundary has steps: with each further swing of the weave a fall takes longer, and a bicycle that has not
+# fallen after five seconds counts as upright.
 #
-# ## Which measurement deserves to be made again?
+# ## Which measurement should be repeated?
 #
-# Above its weave speed this bicycle rides by itself. How well do we know that speed, and which of the 25
-# measured numbers is to blame for what we do not know? No motion is needed: the design alone gives the
-# samples, and `jj.studies.sobol_indices` takes whatever was computed from them.
+# Above its weave speed this bicycle rides by itself. How accurately do we know this speed, and which of the
+# 25 measured numbers causes most of its uncertainty? No motion is needed: a design gives the samples, and
+# `jj.studies.sobol_indices` accepts any quantity that was computed from them.
 
 # %%
 import jax
@@ -216,12 +217,13 @@ axis.set_xlabel("total Sobol' index of the weave speed")
 axis.spines[["top", "right"]].set_visible(False)
 
 # %% [markdown]
-# Half of the variance comes from the tilt of the steer axis: that angle deserves a better measurement first.
+# Half of the variance comes from the tilt of the steer axis, so this angle should be measured more accurately
+# first.
 
 # %% [markdown]
-# The checks that hold this notebook to its numbers: every lane has a result, none failed, fast discs stay up,
-# and the repeated lane is the stored one; slow bicycles fall, fast ones that stand upright do not; and the
-# steer axis comes first.
+# The last cell checks the results of this notebook: every sample has a result, and none failed; fast discs
+# stay up; the repeated motion equals the stored one; slow bicycles fall, fast upright ones do not; and the
+# steer axis has the largest index.
 
 # %%
 assert result.complete

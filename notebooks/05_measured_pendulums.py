@@ -14,11 +14,11 @@
 # %% [markdown]
 # # From pendulums to limits on the weave speed
 #
-# The parts of twelve bicycles were weighed, hung up, swung about an axle and twisted on a rod. From these
-# readings follow the 26 parameters of the Whipple bicycle. Files of parameters tell their standard
-# deviations, but not that they came of the same readings: every moment of inertia shares the stiffness of one
-# rod. We go back to the readings, differentiate the way from them to the parameters, and ask what the
-# covariance does to the limits on the weave speed.
+# The parts of twelve bicycles were weighed, hung up, swung about an axle and twisted on a rod. The 26
+# parameters of the Whipple bicycle follow from these readings. Parameter files contain their standard
+# deviations, but not the correlations due to common readings: every moment of inertia depends on the
+# stiffness of the same rod. We start from the readings, differentiate the parameters with respect to them,
+# and compute the effect of the covariance on the limits of the weave speed.
 
 # %%
 import jax
@@ -41,12 +41,11 @@ from jourdain_jax.bicycle.readings import read_readings
 # %% [markdown]
 # ## Readings
 #
-# Of the rear frame: a compound pendulum about the rear axle gives $I_{yy}$, since $T = 2\pi\sqrt{(I_{yy} + m
-# l^2)/(m g l)}$. Clamped to a rod in three orientations, it twists with $T_i = 2\pi\sqrt{n_i^\top I n_i/k}$,
-# which gives the three moments in its plane. The line of the rod then passes through the mass centre. Both
-# pendulums are scenes, from which the periods come; the parameters are those with which the scenes have the
-# periods that were timed, and their derivatives with respect to the readings follow from the implicit
-# function theorem.
+# For the rear frame, a compound pendulum about the rear axle gives $I_{yy}$, since $T = 2\pi\sqrt{(I_{yy} + m
+# l^2)/(m g l)}$. Clamped to a rod in three orientations, the frame twists with $T_i = 2\pi\sqrt{n_i^\top I
+# n_i/k}$, which gives the three moments in its plane. The line of the rod passes through the mass centre.
+# Both pendulums are scenes with computed periods. The parameters are chosen so that these equal the measured
+# periods, and their derivatives with respect to the readings follow from the implicit function theorem.
 
 # %%
 readings = read_readings(shipped_measurements()["Browser"])
@@ -56,10 +55,10 @@ for name in ("mB", "TcB1", "alphaB1", "aB1", "TtB1", "TtP1"):
 # %% [markdown]
 # ## Against the published parameters
 #
-# Values and sigmas of 20 of the 26 parameters are the published ones to all their digits. The others depend
-# on where the lines through a mass centre meet: the published value is the mean over all pairs of lines, ours
-# has the least squares of distances to the lines. With sigmas as they are stated, they differ by up to 1.5 of
-# them.
+# Values and sigmas of 20 of the 26 parameters agree with the published ones to all published digits. The
+# others depend on the intersection of the lines through a mass centre: the published value is the mean over
+# all pairs of lines, ours minimises the sum of squared distances to the lines. They differ by up to 1.5 of
+# the stated sigmas.
 
 # %%
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")
@@ -75,8 +74,8 @@ for bicycle_name in ("Browser", "Browserins", "Crescendo", "Fisher", "Pista", "Y
 print("apart by so many published sigmas (our sigma over theirs)")
 
 # %% [markdown]
-# Two of the three lines of the Pista's frame are almost parallel. Where they meet is hardly known, and enters
-# the mean as much as the other two crossings. Its ellipse holds 95 %.
+# Two of the three lines of the Pista's frame are almost parallel. Their intersection is hardly known, but has
+# the same weight in the mean as the other two. The ellipse contains 95 %.
 
 
 # %%
@@ -137,7 +136,7 @@ assert of["IRxx"][PARAMETER_NAMES.index("IFxx")] > 0.99
 # %% [markdown]
 # ## What the covariance does to the limits
 #
-# The same parameters, drawn 500 times: as if independent, and with their covariance. Grey: the published
+# The same parameters are drawn 500 times: independently, and with their covariance. Grey shows the published
 # file, as in the notebook on measured bicycles.
 
 

@@ -12,13 +12,13 @@
 # ---
 
 # %% [markdown]
-# # A real bicycle: what impulse responses of a steer-by-wire bicycle tell
+# # A real bicycle: parameters from impulse responses of a steer-by-wire bicycle
 #
-# The fork of this bicycle of TU Delft is turned by a motor; its handlebar was strapped to the frame, and
-# nobody sat on it. On a treadmill, at eight speeds, it was pushed sideways, and a controller steered it into
-# the lean: it asked the motor for $T = k\,(6.5\ \mathrm{m/s} - v)\,\dot\varphi$, $k = 2\
-# \mathrm{N\,s^2/rad}$, with the lean rate $\dot\varphi$ as the gyroscope showed it. The logs hold that
-# command. So we have 57 responses of one second with a known input, and ask what they tell.
+# A motor turns the fork of this riderless bicycle of TU Delft; its handlebar was strapped to the frame. On a
+# treadmill, at eight speeds, it was pushed sideways, and a controller steered it into the lean, with the
+# commanded torque $T = k\,(6.5\ \mathrm{m/s} - v)\,\dot\varphi$, $k = 2\ \mathrm{N\,s^2/rad}$, where
+# $\dot\varphi$ is the lean rate measured by a gyroscope. The logs contain the command. So we have 57
+# responses of one second with a known input. Which parameters do they determine?
 #
 # Data: github.com/mechmotum/sbw_bicycle_with_model_matching, MIT licence, (c) 2017-2022 G. Dialynas and S.
 # Drauksas; `data/steer_by_wire/SOURCES.md`.
@@ -69,27 +69,27 @@ plt.show()
 # %% [markdown]
 # ## What is known, and what is not
 #
-# The authors' files say where each number comes from, and that decides what is estimated:
+# The authors' files state the origin of each number, and this determines what is estimated:
 #
-# | number | what is known of it | here |
+# | number | what is known | here |
 # |---|---|---|
-# | lengths, masses, mass centres, wheels | measured | kept |
-# | inertia of the rear frame | another bicycle's, 1.64 and 1.94 kg m²; noted: 2 and 2.7 fit better | prior |
-# | inertia about the steer axis | rotor: 0.012 to 0.024 kg m²; fork: two notes, 0.036 apart | prior |
-# | torque of the motor | differs from the command by an unknown factor | estimated |
+# | lengths, masses, mass centres, wheels | measured | fixed |
+# | inertia of the rear frame | of another bicycle, 1.64 and 1.94 kg m²; note: 2 and 2.7 fit better | prior |
+# | inertia about the steer axis | rotor: 0.012 to 0.024 kg m²; fork: two notes that differ by 0.036 | prior |
+# | torque of the motor | differs from the command by an unknown factor | factor estimated |
 # | friction and damping at the fork, damping of lean | 0.2 N m of friction when coasting | estimated |
 # | drift | always to one side, from an unknown source | a torque at the fork, estimated |
 # | encoder of the fork | "not properly installed" | its gain is estimated |
-# | steer rate | difference of two angles 0.01 s apart | 0.005 s late |
+# | steer rate | difference of two angles 0.01 s apart | delay of 0.005 s |
 # | gyroscope | on a carrier that is "wonky" | its delay is estimated; its gain cannot be |
 #
-# The last one is no choice of ours. Responses are nearly linear: with motions and torques smaller by one
-# factor, and the gains of both sensors larger by it, all data stay as they are. One gain has to be known, and
-# everything else is relative to the gyroscope.
+# The gain of the gyroscope cannot be estimated because responses are nearly linear: if motions and torques
+# are smaller by one factor, and the gains of all sensors larger by the same factor, the data do not change.
+# One gain must be known; everything else is relative to the gyroscope.
 #
 # The drift is one number for all windows. At the start of each window four values are unknown. Lean and steer
-# have been measured, so they have priors: without these, and without the drift, a fit moves the lean at the
-# start far from where it was measured, to make up for what the scene does not have.
+# were measured, so they have priors. Without these, and without the drift, a fit moves the initial lean far
+# from its measured value to compensate what the scene lacks.
 
 
 # %%
@@ -180,9 +180,10 @@ def run_of(window, sensors):
 
 
 # %% [markdown]
-# ## Two halves of the data, each by itself
+# ## Two halves of the data, fitted separately
 #
-# Odd windows and even ones. Residuals are not white, so that standard errors are taken from how runs differ.
+# The halves are the odd and the even windows. Residuals are not white, so standard errors are computed from
+# differences between runs.
 
 # %%
 guess = nominal.replace(turned=0.035, friction=0.3, steer_damping=0.5, lean_damping=5.0, drift=-0.1)
@@ -217,9 +218,9 @@ assert not even.impossible
 # %% [markdown]
 # ## Windows that were held out
 #
-# Each half predicts the windows of the other one; of these, the four start values alone are fitted. Beside
-# it, the bicycle as the authors have it: their numbers, a motor that does as it is told, no friction, ideal
-# sensors.
+# Each fit predicts the windows of the other half, for which only the four start values are fitted. For
+# comparison, the same is done for the authors' bicycle: their numbers, a motor that follows its command
+# exactly, no friction, ideal sensors.
 
 
 # %%
@@ -269,15 +270,15 @@ assert rms(plain["lean_rate"]) > 0.04
 # %% [markdown]
 # ## The weave eigenvalue over speed
 #
-# What a laboratory often does with such responses: fit $c_1 + e^{\sigma t}(c_2 \cos\omega t + c_3 \sin\omega
-# t)$ to the lean rate of each, which asks for no scene at all. $\sigma + i\omega$ is the weave eigenvalue of
-# bicycle and controller together. From the scene it follows by its linear equations at that speed,
+# Laboratories often fit $c_1 + e^{\sigma t}(c_2 \cos\omega t + c_3 \sin\omega t)$ to the lean rate of each
+# response, which needs no scene. $\sigma + i\omega$ is the weave eigenvalue of bicycle and controller
+# together. It also follows from the linear equations of the scene at that speed,
 #
 # $$\det\left(M s^2 + (C + D) s + K - g\,k\,(6.5 - v)\,s\,e^{-s\tau}\,e_2 e_1^\top\right) = 0,$$
 #
-# with the gain $g$ of the motor, the delay $\tau$ of the gyroscope, and dampings $D$. Friction is no linear
-# thing: at a steer rate of amplitude $a$ it takes as much energy as a damping of $4F/\pi a$. We take $a$ from
-# the windows at that speed; the band is for half of it and twice as much.
+# with the gain $g$ of the motor, the delay $\tau$ of the gyroscope, and dampings $D$. Friction is not linear:
+# at a steer rate of amplitude $a$ it dissipates as much energy as a damping of $4F/\pi a$. We take $a$ from
+# the windows at that speed; the band is for half and twice this amplitude.
 
 
 # %%
@@ -363,20 +364,20 @@ from_3 = np.array(apart_in_frequency)[-5:]  # at 3 m/s and above
 assert from_3[:, 0].max() < 0.4 < 0.8 < from_3[:, 1].min()
 
 # %% [markdown]
-# ## What came out, and where the scene fails
+# ## Results, and where the scene fails
 #
-# - Halves agree, with possible bodies, and predict each other to 0.02 rad/s of lean rate. From 3 m/s on, the
-#   frequency of weave is that of the damped exponentials to 0.4 rad/s; the authors' numbers put it 0.9 rad/s
-#   and more too high.
-# - The decay of weave is stronger than that of the exponentials, slightly at 5 m/s and by a factor of two at
-#   2 m/s. There, friction stops the fork before the window ends: the response is no exponential, and no
-#   equivalent damping stands for that. The authors' numbers agree better with these decays.
+# - The two halves agree, with possible inertias, and predict each other's lean rate to
+#   0.02 rad/s. From 3 m/s on, the weave frequency agrees with the damped exponentials to 0.4 rad/s; with the
+#   authors' numbers it is 0.9 rad/s or more too high.
+# - Weave decays faster than the exponentials, slightly at 5 m/s and by a factor of two at 2 m/s. At 2 m/s,
+#   friction stops the fork before the window ends: the response is not exponential, and no equivalent damping
+#   describes it. The authors' numbers agree better with these decays.
 # - The moment of inertia of the frame about the vertical, 2.8 and 3.1 kg m², is near the 2.7 that the authors
-#   found to fit better. The moment about the roll axis is hardly known: its standard error is as large as its
-#   prior.
-# - A lean damping of 22 N m s/rad has no cause in a bicycle without a rider, and 0.027 s is long for a
-#   gyroscope. Both may stand for tyres that slip sideways, which this scene lacks; the carrier of the
-#   gyroscope may give way, too.
-# - Neighbouring residuals correlate by 0.4 (lean rate) and 0.6 (steer rate): they are no noise. Standard
-#   errors from how runs differ allow for that; they do not tell how far the numbers are from those of the
-#   bicycle.
+#   found to fit better. The moment about the roll axis is hardly determined: its standard error is as large
+#   as that of its prior.
+# - A lean damping of 22 N m s/rad has no physical cause in a bicycle without a rider, and a delay of 0.027 s
+#   is long for a gyroscope. Both may compensate sideways slip of the tyres, which this scene lacks; the
+#   carrier of the gyroscope may also be elastic.
+# - Neighbouring residuals correlate by 0.4 (lean rate) and 0.6 (steer rate), so they are not white noise.
+#   Standard errors from differences between runs account for this; they do not show how far the estimates are
+#   from the true values.
