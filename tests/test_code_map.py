@@ -27,7 +27,7 @@ CEILINGS = {
     "ways: constraints and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, its event search and its adjoint": 1,
-    "code tokens of tests": 335_413,
+    "code tokens of tests": 335_934,
     "code tokens of bench": 108_081,
     "test files that reach private names": 34,
 }
