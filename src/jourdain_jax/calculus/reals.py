@@ -151,7 +151,7 @@ def checked_known(
 
 def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advice: str):
     """Return `value` in the default float: a NumPy array if concrete, also inside `jit`; a JAX array if
-    traced. Raises ValueError as `checked_real`.
+    traced. Raises the same errors as `checked_real`.
     """
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())

@@ -210,7 +210,9 @@ def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callabl
 
 
 def registered(text: str, effort: int = 2) -> str:
-    """Register the handler of a module of LLVM IR and return its name; `effort`: of `host.object_code`."""
+    """Register the handler of a module of LLVM IR and return its name; `effort`: as for
+    `host.object_code`.
+    """
     name = _name(text, effort)
     register(name, text, "cpu", effort)
     return name

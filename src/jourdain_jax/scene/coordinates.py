@@ -130,17 +130,17 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
 
 
 def speeds(names: str) -> Names:
-    """Return the names of user-defined generalized speeds (quasi-velocities, eqs. (53)-(56)) from
-    `names`, a text separated by spaces.
+    """Return the names of user-defined generalized speeds (quasi-velocities, eqs. (53)-(56)) from `names`, a
+    text separated by spaces.
 
-    A scene with such speeds must define `coordinate_rates(t, q, u)`. Raises ValueError as in `coordinates`.
+    A scene with such speeds must define `coordinate_rates(t, q, u)`. Raises the same errors as `coordinates`.
     """
     return _named(names, "speed")
 
 
 def inputs(names: str) -> Names:
     """Return the names of a scene's inputs, such as actuator torques, from `names`, a text separated by
-    spaces. The scene defines their units. Raises ValueError as in `coordinates`.
+    spaces. The scene defines their units. Raises the same errors as `coordinates`.
     """
     return _named(names, "input")
 

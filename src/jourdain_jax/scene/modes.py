@@ -1,5 +1,5 @@
-"""Modes, which are inputs that events switch, and events after which the motion continues, with or without a
-jump of the state.
+"""Modes, and events after which the motion continues. A mode is an input that events switch; an event may
+also make the state jump.
 
     at the time t_e when c(t, q, u) falls through zero:      (q, u) <- R(t, q, u),   mode <- its next value
 

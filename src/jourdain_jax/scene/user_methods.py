@@ -242,8 +242,8 @@ def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
 def _numbers(
     scene: Scene, method: str, at, example: str, what: str, advice: str, shape: Shape | None = ()
 ) -> dict[str, Array]:
-    """Return a method's result at a time, pose or motion: numbers by name, or arrays. `shape`: of each
-    value; None: any.
+    """Return a method's result at a time, pose or motion: numbers by name, or arrays. `shape`: required shape
+    of each value; None: any shape.
     """
     return _checked(scene, _dictionary(scene, method, (at,), example), what, advice, shape)
 

@@ -150,8 +150,8 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities in which operations of these kinds occur: names of `vanishing`, "rank" for the
-    Jacobian of the constraints, and "nonlinear" for its dependence on the speeds.
+    """Return the quantities in which operations of these kinds occur, by name: as in `vanishing`, "rank" for
+    the Jacobian of the constraints, and "nonlinear" for its dependence on the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]

@@ -117,8 +117,8 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Return the coefficients of row s as a combination of the rows `rest` at states of this rank, in units
-    of their typical lengths; infinite where row s is not a combination of them.
+    """Return the coefficients of row s as a combination of the rows `rest`, at states of this rank. They
+    refer to rows in units of their typical lengths, and are infinite where row s is not a combination.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)

@@ -1,5 +1,5 @@
-"""States of a scene's domain, projected onto its constraints: random ones, and symmetric configurations (zero
-and right angles), where partitions that are regular at random states may be singular.
+"""States of a scene's domain, projected onto its constraints: random states, and symmetric configurations
+(zero and right angles). At these a partition of the speeds may be singular that is regular at random states.
 """
 
 import itertools
@@ -33,8 +33,8 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     """Return at most `count` random states (t, q, u) from the scene's domain, on the constraints. Each array
     has a leading axis of states.
 
-    `seed`: of the generator. Raises ValueError if no state satisfies the geometric constraints, or if
-    constraints are NaN at all such states. Raises DifferentiationModeError for traced parameters.
+    `seed`: seed of the random numbers. Raises ValueError if no state satisfies the geometric constraints, or
+    if constraints are NaN at all such states. Raises DifferentiationModeError for traced parameters.
     """
     scene = as_scene(scene)
     checked_whole(count, "`count`", 1, expected="of states, at least 1")
@@ -84,8 +84,8 @@ def drawn_states(
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Entries, "guesses coordinates"]:
-    """Return configurations from which to search for a start: near q, then those of the `states` on the
-    constraints that are nearest to q in coordinates that are not `free`, then random ones in the domain.
+    """Return configurations from which to search for a start: some near q; then the `states` on the
+    constraints nearest to q, measured in the coordinates that are not `free`; then random ones in the domain.
     """
     low, high = coordinate_bounds(scene)
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))

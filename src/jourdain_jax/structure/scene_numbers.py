@@ -115,8 +115,9 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     """Return numbers on the motion of the ground of every contact.
 
-    - "plane": two velocities (m/s) of the contact's plane along its normal: by rates of `origin` and `tilt`,
-      and by the stated `velocity` and `angular_velocity`. Third: the sum of the sizes of all terms.
+    - "plane": two velocities (m/s) of the contact's plane along its normal, by rates of `origin` and
+      `tilt`, and by the stated `velocity` and `angular_velocity`. The third number is the sum of the sizes
+      of all terms.
     - "own plane": the same for a `Contact` with a user-defined point.
     - "ground": the rates of the ground's numbers if only other bodies move, relative to the speeds of these
       bodies; and the size of the ground's stated velocity.

@@ -6,8 +6,8 @@ it, and the impulse of the jump is missing from the motion.
     phi(t, q, 0)                   must be continuous in time: if it jumps and A does not, speeds would jump
 
 A piecewise linear interpolation, for example, has a second derivative of zero at every evaluated point.
-Quantities that branches or calls of JAX affect are therefore evaluated along lines in t and q, to find jumps:
-of r, R and g, and of v, omega and dg/dt at some speeds.
+Quantities that depend on branches or on calls of JAX are therefore evaluated along lines in t and q. The
+search finds jumps of r, R and g, and of v, omega and dg/dt at some speeds.
 """
 
 from collections import Counter

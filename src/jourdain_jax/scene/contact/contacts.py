@@ -65,8 +65,8 @@ class Contact(eqx.Module):
     - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`, shown in pictures.
     - `height`: "coordinates" if the coordinates keep the point on the ground, "row" for a
       geometric constraint.
-    - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
-      supports, alone or with their other contacts (default: all bodies of the scene).
+    - `carried`: names of the bodies that this contact supports, alone or with other contacts (default: all
+      bodies of the scene). With `height="coordinates"` they determine the normal force.
     - `distance` (m): the gap (default: the point's height above the plane).
     - `shape`: for pictures, set by `ball_contact` and similar functions; the scene's `visuals` override it.
     - `friction`, `restitution`, `impact`: as in `ball_contact`.
@@ -161,21 +161,21 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" if the coordinates keep the body on the ground, "row" for a
       geometric constraint.
-    - `carried`: for the normal force with `height="coordinates"`, names of the bodies that this contact
-      supports, alone or with their other contacts (default: all bodies of the scene).
+    - `carried`: names of the bodies that this contact supports, alone or with other contacts (default: all
+      bodies of the scene). With `height="coordinates"` they determine the normal force.
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. The contact then flies, rolls or
       slips (`motion.phase`), and needs `height="row"`. None (default): it never slips.
     - `restitution`: the coefficient e of impacts, from 0 (default) to 1.
     - `impact`: the law of impacts, for normal velocities w_n before and w_n+ after. "moreau" (default): w_n+
       = -e w_n, and Coulomb's law for the slip afterwards. The other laws integrate over the normal impulse,
-      with friction against the instantaneous slip, until: "newton", w_n+ = -e w_n; "poisson", the impulse of
-      restitution is e times the impulse of compression; "energetic", its work is -e^2 times the work of
-      compression. They need a ball, or slip of constant direction, as in plane motion; otherwise a result
-      code reports the failure.
+      with friction against the instantaneous slip. They differ in the end of the integral. "newton": w_n+ =
+      -e w_n. "poisson": the impulse of restitution is e times the impulse of compression. "energetic": its
+      work is -e^2 times the work of compression. These laws need a ball, or slip of constant direction, as in
+      plane motion; otherwise a result code reports the failure.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    height, for a length that is not positive, and, when the scene is built, for a ball that is too large for
-    its cylinder or sphere.
+    The contact has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an
+    unknown height, for a length that is not positive, and, when the scene is built, for a ball that is too
+    large for its cylinder or sphere.
     """
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
