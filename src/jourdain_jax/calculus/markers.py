@@ -34,8 +34,8 @@ from jourdain_jax.calculus.reals import Flag, Scalar
 
 
 def identity(name: str) -> Primitive:
-    """Return a primitive `name` without derivative that returns several arrays unchanged, batch axes
-    included.
+    """Return a primitive called `name` that returns its operands unchanged, also when batched. It has
+    no derivative.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -61,7 +61,7 @@ def lanes_first(tree):
 
 
 def stopped(tree):
-    """Return the tree without derivatives: `jax.lax.stop_gradient` as one operation."""
+    """Return the tree without derivatives, as `jax.lax.stop_gradient` does, but by one operation."""
     leaves, treedef = jax.tree.flatten(tree)
     real = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
     for i, x in zip(real, _stopped_p.bind(*(leaves[i] for i in real)), strict=True):

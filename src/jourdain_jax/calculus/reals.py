@@ -124,7 +124,9 @@ def checked_real(
 
 
 def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str = "use metres") -> Array:
-    """Check as `checked_real` and raise ValueError for concrete numbers that are not positive."""
+    """Return the result of `checked_real`. Also raise ValueError for concrete numbers that are
+    not positive.
+    """
     found = checked_real(value, what, shape, advice=advice)
     if not np.all(known_numbers(found) > 0):
         raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected positive numbers; {advice}")

@@ -57,7 +57,7 @@ class Baumgarte(eqx.Module):
 class Accelerations(eqx.Module):
     """Accelerations of one state with diagnostics: `M udot + h = Q + A' lambda`, `A udot = -drift`.
 
-    Units are those of the speeds per s; a `constraint_force` acts on a speed, in N or N m.
+    `udot` has the units of the speeds per s; a `constraint_force` acts on a speed, in N or N m.
     """
 
     udot: Speeds

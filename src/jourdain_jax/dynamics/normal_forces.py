@@ -38,8 +38,8 @@ def normal_forces(
     spare: Wrenches,
     size,
 ):
-    """Return the normal force (N) of every contact of `height="coordinates"`, by name, and whether it is
-    determined.
+    """Return the normal force (N) of every contact with `height="coordinates"`, by name, and whether it
+    is determined.
 
     - `bodies`, `positions`: names and mass centres (m) of all bodies.
     - `hidden`: forces on the bodies that are neither loads nor constraint forces.

@@ -244,7 +244,7 @@ NEXT, COUNT, IN, OUT = range(4)
 
 
 def start_counting(w: Writer, job: Value, word: int) -> None:
-    """Reset the counter of lanes taken: a word of the job, or on a GPU the word to which it points."""
+    """Reset the counter of lanes taken: a word of the job, or on a GPU the word to which the job points."""
     w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
 
 

@@ -1,6 +1,5 @@
-"""Attributes by which LLVM inlines functions of a GPU module: small ones, and those called once.
-
-Only in inlined functions do local values stay in registers.
+"""Inlining attributes of functions in a GPU module. They make LLVM inline small functions and functions
+called once, because local values stay in registers only in inlined functions.
 """
 
 import re

@@ -340,7 +340,9 @@ class Writer:
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}")
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Return pointers to rows of memory, each in a register. LLVM reaches nearby rows by offsets."""
+        """Return pointers to rows of memory, each in a register, from which LLVM reaches nearby
+        rows by offsets.
+        """
         assert not self.device
         found, place = [], self.room(type="ptr")
         for row in rows:

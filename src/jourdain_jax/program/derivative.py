@@ -229,7 +229,9 @@ def on_its_own(
 def _entries(
     graph: Graph, outputs: Sequence[int], variables: Sequence[int]
 ) -> list[tuple[int, int, int]] | None:
-    """Return row, column and node of each structurally nonzero entry; None if JAX's derivative is better."""
+    """Return row, column and node of each structurally nonzero entry; None if differentiation by
+    JAX is cheaper.
+    """
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None

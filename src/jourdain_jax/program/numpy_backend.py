@@ -1,4 +1,4 @@
-"""JAX primitives on NumPy arrays, for single evaluations that take less time than a compilation.
+"""JAX primitives on NumPy arrays. A single evaluation takes less time than a compilation.
 
 Primitives without a rule here run one by one in JAX, which takes tens of milliseconds each to compile.
 """
@@ -281,7 +281,7 @@ def _lu(equation, A):
 
 
 def _platform(equation):
-    """Return the index of the CPU implementation, or of the one for all platforms."""
+    """Return the index of the implementation for CPUs, or for all platforms."""
     return np.asarray(
         next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names),
         np.int32,

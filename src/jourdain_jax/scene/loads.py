@@ -76,7 +76,7 @@ def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) ->
 
 def point_force(point: Point, force: Any) -> Load:
     """Return the load of a `force` (3,) (N, inertial frame) on a `point` of a body,
-    `motion["body"].point(local)`; no potential.
+    `motion["body"].point(local)`. It has no potential.
     """
     point = _as_point(point, "point of a force")
     advice = "give three components in the inertial frame, N"
@@ -87,7 +87,7 @@ def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = Non
     """Return a torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, and the opposite torque
     on the body `reaction`, if given.
 
-    No potential. Raises ValueError for an unknown body.
+    It has no potential. Raises ValueError for an unknown body.
     """
     motion = _motion(motion, "torque")
     moment = checked_real(
@@ -114,7 +114,8 @@ def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
 
 
 def damper(a: Point, b: Point, damping: Any) -> Load:
-    """Return a linear damper between two points `a`, `b`: tension `c dl/dt` along the line; no potential.
+    """Return a linear damper between two points `a`, `b`, with the tension `c dl/dt` along the line. It has
+    no potential.
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `damping` c in N s/m.
     """

@@ -129,8 +129,8 @@ class Pose(eqx.Module):
 
 
 class Motion(eqx.Module):
-    """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`,
-    `motion.u.yaw_rate`.
+    """Time, coordinates, speeds, inputs and the motion of all bodies, such as `motion.u.yaw_rate` and
+    `motion["disc"].velocity`.
     """
 
     t: Scalar

@@ -221,10 +221,11 @@ class Scene(eqx.Module):
         return scene_html(self)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy of this scene with changed parameters. `changes`: name -> value in the parameter's
-        unit.
+        """Return a copy of this scene with changed parameters. `changes`: name -> value in the
+        parameter's unit.
 
-        Raises ValueError for an inadmissible value, and for an unknown name with the nearest valid one.
+        Raises ValueError for an inadmissible value or an unknown name; for the latter it suggests the
+        nearest valid one.
         """
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:

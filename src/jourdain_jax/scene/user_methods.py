@@ -203,7 +203,9 @@ def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
-    """Return the scene's own shapes of its bodies; the name `""` holds shapes fixed in the inertial frame."""
+    """Return the scene's own shapes of its bodies; shapes under the name `""` are fixed in the
+    inertial frame.
+    """
     given = _dictionary(scene, "visuals", (pose,), '{"ball": jj.Visual.ball(0.1)}')
     found = {}
     for name, looks in given.items():

@@ -82,19 +82,19 @@ class Visual(eqx.Module):
     @staticmethod
     def ball(radius, **look: Unpack[Look]) -> "Visual":
         """Return a ball of the given `radius` (m). Its octants alternate in colour, which shows rotation.
-        `look`: as for all shapes.
+        `look`: see `Visual`.
         """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
     @staticmethod
     def ellipsoid(semi_axes, **look: Unpack[Look]) -> "Visual":
-        """Return an ellipsoid with three `semi_axes` (m) along its axes; `look` as for all shapes."""
+        """Return an ellipsoid with three `semi_axes` (m) along its axes; `look`: see `Visual`."""
         return shape("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), **look)
 
     @staticmethod
     def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
         """Return a wheel or disc of `radius` and `width` (m; default: a sixth of the radius) about `axis`
-        ("x", "y" or "z"). Its quarters alternate in colour. `look`: as for all shapes.
+        ("x", "y" or "z"). Its quarters alternate in colour. `look`: see `Visual`.
         """
         radius = _lengths(radius, "radius of a wheel", ())
         width = radius / 6 if width is None else _lengths(width, "width of a wheel", ())
@@ -102,21 +102,21 @@ class Visual(eqx.Module):
 
     @staticmethod
     def box(sides, **look: Unpack[Look]) -> "Visual":
-        """Return a box with three `sides` (m) along its axes; `look` as for all shapes."""
+        """Return a box with three `sides` (m) along its axes; `look`: see `Visual`."""
         return shape("box", _lengths(sides, "sides of a box", (3,)), **look)
 
     @staticmethod
     def cylinder(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
-        """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all
-        shapes.
+        """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look`:
+        see `Visual`.
         """
         radius = _lengths(radius, "radius of a cylinder", ())
         return _about(axis, "cylinder", [radius, _lengths(length, "length of a cylinder", ())], **look)
 
     @staticmethod
     def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
-        """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as
-        for all shapes.
+        """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look`:
+        see `Visual`.
         """
         radius = _lengths(radius, "radius of a capsule", ())
         return _about(axis, "capsule", [radius, _lengths(length, "length of a capsule", ())], **look)
@@ -125,7 +125,7 @@ class Visual(eqx.Module):
     def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
         """Return a bar of round section from each of the `points` (m, body frame) to the next.
 
-        `radius` in m (default: thin); `colour`, `opacity` as for all shapes.
+        `radius` in m (default: thin); `colour`, `opacity`: see `Visual`.
         """
         if len(points) < 2:
             raise ValueError(
@@ -140,7 +140,7 @@ class Visual(eqx.Module):
     @staticmethod
     def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
         """Return a spring between two points `a`, `b` (m, body frame): a wire with a number of `turns` and a
-        `radius` (m). `colour`, `opacity` as for all shapes.
+        `radius` (m). `colour`, `opacity`: see `Visual`.
         """
         a, b = (
             checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float)
@@ -162,7 +162,7 @@ class Visual(eqx.Module):
 
         `vertices`: (points, 3) in m; `faces`: for each face a list of vertex indices, anticlockwise seen from
         outside. Both must be concrete numbers. `scale`: one factor or three, which may depend on parameters;
-        `look`: as for all shapes.
+        `look`: see `Visual`.
         """
         advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
         corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
@@ -184,7 +184,7 @@ class Visual(eqx.Module):
     def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """Return the mesh in the file `path`, in a format of `trimesh`, such as .stl or .obj.
 
-        `scale`: factor, 0.001 for millimetres; `look`: as for all shapes. Raises ImportError without
+        `scale`: factor, 0.001 for millimetres; `look`: see `Visual`. Raises ImportError without
         `trimesh` (the extra `robots`), and ValueError for a missing file, an unknown format, or a mesh
         without faces.
         """
@@ -221,7 +221,7 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
 def shape(
     kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None
 ) -> Visual:
-    """Return a shape of this `kind` and `size`; the other arguments are as for all shapes."""
+    """Return a shape of this `kind` and `size`; other arguments: see `Visual`."""
     advice = "give three components in the body frame, m"
     at = checked_real(at, f"place of a {kind}", (3,), advice=advice).astype(real_type())
     turn = jnp.eye(3) if turn is None else turn

@@ -43,8 +43,8 @@ def explicit_power(
 
 
 def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
-    """Return the rate of the scene's own potential due to poses that move at `u = 0`. The potential's forces
-    act on the speeds and do no work in this motion.
+    """Return the rate of the scene's own potential due to poses that move at `u = 0`. The forces of this
+    potential act on the speeds only, so they do no work in this motion.
     """
     if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(motion.t)
@@ -85,7 +85,7 @@ def power_of_loads(
 
 
 def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
-    """Return `dV/dt` of a `potential` with fixed poses, and with the coordinates moving as at `u = 0`."""
+    """Return `dV/dt` of a `potential` at fixed poses, with coordinates that move as at `u = 0`."""
     q = motion.q.array
     nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
 
@@ -97,8 +97,8 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
 
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """Return `f` with only the operations that its result needs: unused forces of the same loads may lack a
-    derivative.
+    """Return `f` without operations that its result does not need. These may lack a derivative, such as
+    unused forces of the same loads.
     """
     pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

@@ -57,7 +57,7 @@ _MOTION = frozenset(
 
 
 class Probed(eqx.Module):
-    """Probed quantities at one state, or at many with a leading axis; trees have arrays as leaves."""
+    """Probed quantities at one state, or at many with a leading axis. Some are trees of arrays."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric constraints
     position_error: Float[Entries, "*states"]  # as in `Assembled`

@@ -102,8 +102,8 @@ def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return intervals on 6 lines across the bounding box of the states `q`, 48 on each, at random times.
 
     The lines are projected onto the geometric constraints. Off them a constraint may jump at states that no
-    motion reaches, as inside a body that others roll on. Intervals with an end that does not converge, or
-    with ends far apart, are omitted.
+    motion reaches, for example inside a body on which others roll. Intervals with an end that does not
+    converge, or with ends far apart, are omitted.
     """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))

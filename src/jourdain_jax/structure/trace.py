@@ -98,7 +98,7 @@ def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
 
 
 def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
-    """Return rates in time of loads and potentials at fixed motion, poses included."""
+    """Return the rates in time of loads and potentials at a fixed motion, including fixed poses."""
 
     def pieces(t):
         held = eqx.tree_at(lambda m: m.t, motion, t)

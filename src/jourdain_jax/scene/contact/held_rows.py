@@ -38,7 +38,7 @@ class HeldRow(eqx.Module):
 
 
 class JointFriction(Load):
-    """Friction on speeds: constraints that hold until their force exceeds a limit, by name of the speed."""
+    """Friction on speeds. Each speed has a constraint that holds until its force exceeds a limit."""
 
     rows: dict[str, HeldRow]
 
@@ -53,9 +53,9 @@ def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
     - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
       static)` with two forces.
 
-    The force Q on a speed u is `-F u/|u|`. A speed of zero stays zero as long as `|Q| <= F` suffices.
-    `motion.phase("hinge_rate")` returns whether the speed holds or slips. Raises ValueError for an unknown
-    speed.
+    The force Q on a speed u is `-F u/|u|`. A speed of zero stays zero as long as a force with `|Q| <= F` can
+    hold it. `motion.phase("hinge_rate")` returns whether the speed holds or slips. Raises ValueError for an
+    unknown speed.
 
     **Examples**
 
