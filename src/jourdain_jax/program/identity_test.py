@@ -4,7 +4,7 @@ Sums, products, quotients, roots, sines and cosines of random generic numbers ag
 everywhere (Schwartz, 1980; Zippel, 1979). The numbers of a scene are not generic: a parameter may be tiny, or
 time may end before a switch. Functions that branch or saturate may also behave differently between probes.
 Inputs are therefore replaced by random numbers, of order one and larger, and any other function by a generic
-one that is neither flat nor kinked. An identity that holds with these replacements holds for all such functions.
+one that is neither flat nor kinked. An identity that then holds is valid for all such functions.
 
 No comparison uses a fixed tolerance. Every value carries a round-off bound (`calculus/round_off.py`), and two
 values count as equal if their difference is within their bounds. Constants in the code of a scene may be far
