@@ -31,7 +31,7 @@ from jax.interpreters import mlir
 import jourdain_jax as jj
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.kernels import ffi, host, nvidia
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.studies import Uniform
 
 DISC, BICYCLE = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()

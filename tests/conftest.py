@@ -150,10 +150,10 @@ def _compiled_programs_are_dropped():
 @pytest.fixture(scope="module")
 def small_blocks():
     """Blocks of a study are of 32 lanes, so that few lanes make several."""
-    from jourdain_jax.studies import task
+    from jourdain_jax.studies import outputs
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "LARGEST_BLOCK", 32)
+        patch.setattr(outputs, "LARGEST_BLOCK", 32)
         yield
 
 

@@ -19,8 +19,7 @@ import jourdain_jax as jj
 from jourdain_jax import structure_of
 from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
-from jourdain_jax.dynamics.power import power
-from jourdain_jax.dynamics.reactions import row_reactions
+from jourdain_jax.dynamics.reactions import power, row_reactions
 from jourdain_jax.equations import (
     GibbsAppell,
     coordinate_rates,
@@ -32,9 +31,8 @@ from jourdain_jax.equations import (
 )
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
-from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
+from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce, scaled
 from jourdain_jax.equations.rows import ConstraintRows
-from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.program.eager import uncompiled_lanes
 from jourdain_jax.scene.identity import reference_parameters
 from jourdain_jax.structure.load_power import power_of_loads

@@ -15,9 +15,8 @@ from jourdain_jax.analysis.verification import Check
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.trajectories.diagnostics import Diagnostics, Energies
 from jourdain_jax.scene import description
-from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.coordinates import Coordinates, Named, Names
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point, Pose
-from jourdain_jax.scene.names import Named
 
 # what a user is handed without having imported it
 HANDED_OUT = (

@@ -24,7 +24,7 @@ from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.structure.trace import named_values
 
 DRAWS, STATES = 5, 20

@@ -20,7 +20,7 @@ from test_modes import NUMBERS, seen
 
 import jourdain_jax as jj
 from jourdain_jax.kernels import ffi, gpu, nvidia
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.studies import Design, LogNormal, LogUniform, Normal, Uniform
 
 pytestmark = pytest.mark.skipif(

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.program.calls import interpret_with_calls
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import equal, identity_probes, on_rows, unaffected
 from jourdain_jax.program.interpret import Nodes, as_nodes
-from jourdain_jax.program.opaque_calls import interpret_with_calls
 
 COUNT = 40
 

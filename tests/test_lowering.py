@@ -17,7 +17,7 @@ import jourdain_jax as jj
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
 from jourdain_jax.program import numpy_backend
-from jourdain_jax.program.fused_loop import fused
+from jourdain_jax.program.emit import fused
 
 # What lowering does to a scene, what it says where it does not, and derivatives through the program.
 

@@ -25,10 +25,9 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
-from jourdain_jax.dynamics.power import power
+from jourdain_jax.dynamics.reactions import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.integrate import event_search
-from jourdain_jax.integrate.arrays import array_adjoint as backwards
 from jourdain_jax.integrate.arrays import array_functions
 from jourdain_jax.integrate.arrays import array_loop as on_arrays
 from jourdain_jax.integrate.arrays import array_motion as motions
@@ -607,7 +606,7 @@ MUTANTS = [
     Mutant("every start at an event", event_search, "at_start", "noise * rate", "rate", LEAVES, "leaves"),
     Mutant(
         "no cotangents of later stages",
-        backwards,
+        on_arrays,
         "step_back",
         "columns[stage][j], total)",
         "0 * columns[stage][j], total)",
@@ -616,7 +615,7 @@ MUTANTS = [
     ),
     Mutant(
         "one stage without parameters",
-        backwards,
+        on_arrays,
         "step_back",
         "at, v, of_stage, added)",
         "at, v, of_stage, w.room(max(asked, 1)))",
@@ -625,7 +624,7 @@ MUTANTS = [
     ),
     Mutant(
         "a projection not gone back over",
-        backwards,
+        on_arrays,
         "step_back",
         "at, g1, added)",
         "at, w.room(count), added)",
@@ -655,7 +654,7 @@ MUTANTS = [
     ),
     Mutant(
         "time of an event forgotten",
-        backwards,
+        on_arrays,
         "event_back",
         "total = w.load(g_t)",
         "total = 0 * w.load(g_t)",
@@ -673,7 +672,7 @@ MUTANTS = [
     ),
     Mutant(
         "an event by parameters forgotten",
-        backwards,
+        on_arrays,
         "event_back",
         "with_event(w.load(by_known, i), w.load(added, i))",
         "w.load(by_known, i)",
@@ -689,7 +688,7 @@ def _nothing_kept(monkeypatch):
     """Programs are built in each test, and none of them afterwards; short windows, so that a motion has
     several; functions of a test's own.
     """
-    monkeypatch.setattr(backwards, "SLOTS", 8)
+    monkeypatch.setattr(on_arrays, "SLOTS", 8)
     monkeypatch.setattr(array_functions, "integrands", None)
     lower._lowered.cache_clear()
     yield
@@ -709,7 +708,7 @@ def test_a_mutant_is_caught(mutant, monkeypatch):
 
 
 def test_a_record_goes_back_over_fewer_steps_than_it_has_room_for(monkeypatch):
-    monkeypatch.setattr(backwards, "SLOTS", 48)
+    monkeypatch.setattr(on_arrays, "SLOTS", 48)
     run, arguments = loop(driven, **CASES["saved times"]), given("saved times")
     assert_allclose(
         backwards_through(*run(*arguments), motion(run)(*arguments))[1],

@@ -16,10 +16,10 @@ from small_scenes import OnLine
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
+from jourdain_jax.program.calls import interpret_with_calls
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes
-from jourdain_jax.program.opaque_calls import interpret_with_calls
 from jourdain_jax.structure.trace import event_values
 
 

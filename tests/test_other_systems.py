@@ -26,7 +26,7 @@ from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.kernels import ffi, host
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.studies import folder_lock, memory, workers
+from jourdain_jax.studies import memory, records, workers
 from jourdain_jax.studies.store import Store
 
 SOURCE = Path(jj.__file__).parent
@@ -221,7 +221,7 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
     assert len(asked) == 1
-    with runpy.run_path(folder_lock.__file__)["locked"](tmp_path / "lock"):
+    with runpy.run_path(records.__file__)["locked"](tmp_path / "lock"):
         pass
 
 

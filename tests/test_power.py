@@ -8,7 +8,7 @@ from timed_scenes import TIMED
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.dynamics.power import power
+from jourdain_jax.dynamics.reactions import power
 from jourdain_jax.equations import coordinate_rates, kinetic_energy, potential_energy, unconstrained_equations
 from jourdain_jax.models import (
     BallOnTurntable,

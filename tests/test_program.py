@@ -15,12 +15,11 @@ from numpy.testing import assert_allclose
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.derivative import derivatives, directional_derivative
 from jourdain_jax.program.emit import run, sine_and_cosine
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import Probes, more_operations
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms, TooLarge
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
-from jourdain_jax.program.subgraph import more_operations
 
 
 @pytest.fixture

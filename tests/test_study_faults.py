@@ -33,7 +33,7 @@ from test_studies import assert_same
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.scene.digests import digest
-from jourdain_jax.studies import End, InUseError, Uniform, folder_lock, merge_studies, records, store, workers
+from jourdain_jax.studies import End, InUseError, Uniform, merge_studies, records, store, workers
 from jourdain_jax.studies.run import Runner, opened
 from jourdain_jax.studies.store import Store
 
@@ -287,7 +287,7 @@ def test_other_chunks_than_the_study_began_with_are_refused(whole):
         run(whole.store.path, chunk=64)
 
 
-@pytest.mark.skipif(folder_lock.fcntl is None, reason="no locks on this system")
+@pytest.mark.skipif(records.fcntl is None, reason="no locks on this system")
 def test_a_second_run_into_one_folder_is_refused_while_the_first_lives(whole):
     with whole.store.lock(), pytest.raises(InUseError, match=f"in use by process {os.getpid()} on "):
         run(whole.store.path)
@@ -713,7 +713,7 @@ def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):
 SCRIPT = """
 import sys
 import jourdain_jax as jj
-from jourdain_jax.studies import task
+from jourdain_jax.studies import outputs
 
 
 def spread(motion, allowed=frozenset({"lean", "yaw", "spin", "x"})):

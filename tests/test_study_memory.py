@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_study_faults import run, study
 
 import jourdain_jax as jj
-from jourdain_jax.studies import End, memory, task
+from jourdain_jax.studies import End, memory, outputs
 from jourdain_jax.studies.statistics import Tally
 
 TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
@@ -15,7 +15,7 @@ TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
 
 @pytest.fixture(autouse=True)
 def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+    monkeypatch.setattr(outputs, "LARGEST_BLOCK", 32)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
     ):
         run(tmp_path / "discs.zarr", memory=bound)
     monkeypatch.undo()
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+    monkeypatch.setattr(outputs, "LARGEST_BLOCK", 32)
     assert run(tmp_path / "discs.zarr").complete
 
 

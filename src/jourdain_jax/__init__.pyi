@@ -14,7 +14,7 @@ from .calculus.derivative_errors import DifferentiationModeError
 from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from .calculus.vectors import vec
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
-from .dynamics.newton_euler import newton_residual
+from .dynamics.reactions import newton_residual
 from .equations.kinematics import motion_at, pose_at
 from .equations.virtual_power import virtual_power
 from .identification.data.estimate import Estimate, bounds, positive
@@ -26,9 +26,8 @@ from .importers.urdf import from_urdf
 from .integrate.discrete_gradient import DiscreteGradient
 from .integrate.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
 from .integrate.explicit_steps import Taylor
-from .integrate.implicit_midpoint import ImplicitMidpoint
+from .integrate.implicit_steps import ImplicitMidpoint, RadauIIA
 from .integrate.inputs import Sampled
-from .integrate.radau import RadauIIA
 from .integrate.result_codes import SimulationError
 from .integrate.state_projection import State
 from .integrate.vector_fields.field import Formulation
@@ -45,8 +44,7 @@ from .motion.start import consistent, start
 from .motion.trajectories.diagnostics import diagnose
 from .motion.trajectories.storage import load_rollout, load_trajectory, save
 from .motion.trajectories.trajectory import Trajectory
-from .scene.bodies import Particle, RigidBody
-from .scene.constraints import knife_edge, pin, rod, weld
+from .scene.bodies import Particle, RigidBody, Visual
 from .scene.contact.contacts import (
     Contact,
     Coulomb,
@@ -56,16 +54,26 @@ from .scene.contact.contacts import (
     wheel_contact,
 )
 from .scene.contact.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
-from .scene.contact.held_rows import joint_friction
-from .scene.coordinates import coordinates, inputs, quaternion, speeds
+from .scene.coordinates import coordinates, inputs, parameter, quaternion, speeds
 from .scene.identity import clear_caches
-from .scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+from .scene.loads import (
+    Load,
+    damper,
+    generalized_force,
+    gravity,
+    joint_friction,
+    knife_edge,
+    pin,
+    point_force,
+    rod,
+    spring,
+    torque,
+    weld,
+)
 from .scene.modes import Event, modes
 from .scene.motion_state import fixed_point
-from .scene.parameter_fields import parameter
 from .scene.scene import Scene
 from .scene.spline import Spline
-from .scene.visuals import Visual
 from .structure.sampling import sample_states
 from .structure.structure import structure_of
 from .studies.result import load_study

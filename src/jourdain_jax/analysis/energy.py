@@ -1,7 +1,7 @@
 """Compute the energy of a scene, and determine whether it is conserved.
 
 E = T + V,   T = sum m v.v/2 + omega.I omega/2
-    dE/dt = power of loads without a potential (`dynamics/power.py`)
+    dE/dt = power of loads without a potential (`dynamics/reactions.py`)
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import Scalar, largest
 from jourdain_jax.dynamics.accelerations import bare_accelerations
-from jourdain_jax.dynamics.power import power
+from jourdain_jax.dynamics.reactions import power
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
 from jourdain_jax.scene.arguments import of_known_numbers

@@ -15,7 +15,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.calculus.reals import Indices, array_module, largest
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.scene import Scene
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.eigenvalue_derivatives import Sensitivities, sensitivities
-from jourdain_jax.analysis.families.spectrum import mode_names
+from jourdain_jax.analysis.families.equations import mode_names
 from jourdain_jax.analysis.linear_matrices import matrices_of, own_rate
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
@@ -34,11 +34,11 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.state_projection import State
-from jourdain_jax.lowering.kinks import bent_load
+from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, warn
-from jourdain_jax.scene.names import Labels, as_names, check_name
+from jourdain_jax.scene.coordinates import Labels, as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import WELL_CONDITIONED

@@ -22,7 +22,7 @@ from jourdain_jax.kernels import ffi
 from jourdain_jax.motion.model import Model, build, modelled
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_users_lines
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import COORDINATE_DOMAIN, SPEED_DOMAIN

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import described, rank_cutoff, static
-from jourdain_jax.scene.names import Labels, as_names, check_names
+from jourdain_jax.scene.coordinates import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed, matrix
 from jourdain_jax.structure.rank import pivot_columns
 

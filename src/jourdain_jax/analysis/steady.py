@@ -50,7 +50,7 @@ from jourdain_jax.scene.arguments import (
     as_time,
     shown_from_users_lines,
 )
-from jourdain_jax.scene.names import Labels, as_names, check_names
+from jourdain_jax.scene.coordinates import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.calculus.reals import Entries, Indices, all_finite, array_module, rank_cutoff, tiny_of
-from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.reductions import scaled
 from jourdain_jax.equations.scene_parts import names_of_position_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.names import Labels, check_names
+from jourdain_jax.scene.coordinates import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.structure.structure import WELL_CONDITIONED, structure_of, usual_rows

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 
 from jourdain_jax.calculus.reals import static
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.printing import Printed
 
 # in double and in single precision, relative to the size of the compared quantities

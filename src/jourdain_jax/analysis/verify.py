@@ -24,15 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.derivative_checks import by_reduction, gradient_checks
-from jourdain_jax.analysis.statements import statement_checks
+from jourdain_jax.analysis.statements import by_reduction, gradient_checks, statement_checks
 from jourdain_jax.analysis.verification import Verification, check
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
-from jourdain_jax.dynamics.newton_euler import newton_residual
-from jourdain_jax.dynamics.power import power
-from jourdain_jax.dynamics.reactions import row_reactions
+from jourdain_jax.dynamics.reactions import newton_residual, power, row_reactions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import (
     coordinate_rates,
@@ -43,10 +40,14 @@ from jourdain_jax.equations.kinematics import (
     shapes_along_motion,
     velocities,
 )
-from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
-from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.reductions import row_scale, speed_scale
 from jourdain_jax.equations.scene_parts import names_of_rows
-from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
+from jourdain_jax.equations.virtual_power import (
+    energies_at,
+    equations_and_rows,
+    lagrange_equations,
+    speeds_are_rates,
+)
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.check import check as look_for_mistakes
 from jourdain_jax.motion.simulate import as_state

@@ -29,7 +29,7 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Indices, Scalar, real_type
-from jourdain_jax.scene.names import Labels, Sentences, check_name
+from jourdain_jax.scene.coordinates import Labels, Sentences, check_name
 
 PerHanging = Float[Array, "hangings"]
 Values = dict[str, Scalar]

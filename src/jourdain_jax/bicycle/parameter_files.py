@@ -20,8 +20,8 @@ from jourdain_jax.calculus import files
 from jourdain_jax.calculus.files import read_text, shortened
 from jourdain_jax.identification.data.estimate import Correlated, joint_normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.scene.names import Labels, check_name
-from jourdain_jax.studies.distributions import Normal
+from jourdain_jax.scene.coordinates import Labels, check_name
+from jourdain_jax.studies.design import Normal
 
 _FORMAT = "`name = value` or `name = value+/-sigma`, for example `rF = 0.35+/-0.001`"
 _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric

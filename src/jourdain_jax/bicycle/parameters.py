@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Bool
 
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.scene.names import Labels, Sentences
+from jourdain_jax.scene.coordinates import Labels, Sentences
 
 # name -> unit, meaning and sign, in the order of the paper's table and of arrays of parameters
 PARAMETERS: dict[str, Mapping] = {

@@ -31,7 +31,7 @@ from pathlib import Path
 from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
 from jourdain_jax.calculus.files import name_of
 from jourdain_jax.calculus.reals import Indices
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 
 _FORM = (
     "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"

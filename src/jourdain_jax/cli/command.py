@@ -16,8 +16,8 @@ from jourdain_jax.calculus.lazy_imports import version_of
 from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
 from jourdain_jax.cli.model_verbs import add as add_model_verbs
 from jourdain_jax.cli.sweep_verbs import add as add_sweep_verb
-from jourdain_jax.scene.names import nearest
-from jourdain_jax.studies.folder_lock import InUseError
+from jourdain_jax.scene.coordinates import nearest
+from jourdain_jax.studies.records import InUseError
 
 OK, FAILED, USAGE = 0, 1, 2
 VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")

@@ -16,7 +16,7 @@ from jourdain_jax.motion.start import start
 from jourdain_jax.motion.trajectories.diagnostics import diagnose
 from jourdain_jax.motion.trajectories.storage import save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.views.pictures import animate, check_suffix
 from jourdain_jax.views.quantities import check_format, plot

@@ -37,9 +37,8 @@ from jourdain_jax.cli.model_verbs import plain
 from jourdain_jax.models.registry import model
 from jourdain_jax.motion.model import build
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN
-from jourdain_jax.scene.names import check_names, nearest
-from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-from jourdain_jax.studies.folder_lock import InUseError
+from jourdain_jax.scene.coordinates import check_names, nearest
+from jourdain_jax.studies.design import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.studies.outputs import (
     End,
     EventTime,
@@ -49,6 +48,7 @@ from jourdain_jax.studies.outputs import (
     LargestMagnitude,
     Smallest,
 )
+from jourdain_jax.studies.records import InUseError
 from jourdain_jax.studies.result import LEVELS, StudyResult, load_study, merge_studies
 from jourdain_jax.studies.study import REFUSED, Study
 

@@ -19,12 +19,13 @@ from jourdain_jax.equations.reductions import (
     Privileged,
     Reduced,
     Reduction,
+    ScaledProblem,
     UdwadiaKalaba,
     reduce,
+    scaled,
     smallest_that_counts,
 )
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
-from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import (
@@ -35,7 +36,7 @@ from jourdain_jax.scene.arguments import (
     as_speeds,
     as_time,
 )
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.coordinates import check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import structure_of, usual_rows
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Indices, eps_of, largest, rank_cutoff, tiny_of
 from jourdain_jax.scene.contact.contacts import Contact
-from jourdain_jax.scene.names import Labels, check_names
+from jourdain_jax.scene.coordinates import Labels, check_names
 
 
 class Wrenches(eqx.Module):

@@ -26,13 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.dynamics.newton_euler import potential_resultants
+from jourdain_jax.dynamics.reactions import potential_resultants
 from jourdain_jax.equations.kinematics import coordinate_rates, of_bodies
 from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.identity import once_per_values
-from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.sampling import sample_states
 from jourdain_jax.structure.structure import structure_of

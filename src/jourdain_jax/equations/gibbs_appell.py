@@ -13,9 +13,15 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
-from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
+from jourdain_jax.equations.reductions import (
+    APPLICABLE_PIVOT,
+    Partition,
+    Reduced,
+    reduced,
+    scaled,
+    solve_definite,
+)
 from jourdain_jax.equations.rows import ConstraintRows
-from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Flag
-from jourdain_jax.equations.reductions import cholesky
-from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.reductions import cholesky, row_scale, speed_scale
 
 
 class Change(NamedTuple):

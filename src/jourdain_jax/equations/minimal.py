@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Speeds
 from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
 from jourdain_jax.equations.kinematics import Inertias, inertias_of
-from jourdain_jax.equations.reductions import Partition, Reduced, appell, reduced
-from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.reductions import Partition, Reduced, appell, reduced, row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import equations_of, mass_matrix
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene

@@ -10,6 +10,14 @@ velocity.
 
 a_0, alpha_0 in h come from a second directional derivative, never from dM/dq. Angular quantities are in body
 axes. Source: Wang and Pao (2003), eqs. (18), (50), (56).
+
+Lagrange's equations in energy-derivative form, for scenes whose speeds are the coordinate rates (S2 of
+docs/paper_by_example.md).
+
+    d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
+
+They give M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, and h is `d/dt(dT/dqdot) -
+dT/dq` at qddot = 0. Source: Wang and Pao (2003), eq. (11).
 """
 
 import equinox as eqx
@@ -35,11 +43,11 @@ from jourdain_jax.equations.kinematics import (
 )
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
 from jourdain_jax.scene.contact.friction_contacts import FLIES, ROLLS, SLIPS
+from jourdain_jax.scene.coordinates import check_name
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import loads_of, potential_of
 
@@ -335,3 +343,37 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
     udot = as_speeds(scene, udot, "udot")
     virtual_velocity = as_speeds(scene, virtual_velocity, "virtual_velocity")
     return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)
+
+
+@eager_if_concrete
+def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+    """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq =
+    Q`; eq. (11).
+
+    `inputs`: values of the scene's inputs (default: zero). Raises ValueError if the speeds are not the
+    coordinate rates.
+    """
+    if not speeds_are_rates(as_scene(scene)):
+        raise ValueError(
+            f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are "
+            "quasi-velocities; use Appell's equations"
+        )
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
+
+    def momentum(t, q, u):
+        return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)
+
+    M = jax.jacfwd(momentum, argnums=2)(t, q, u)
+    _, momentum_rate = jax.jvp(lambda t, q: momentum(t, q, u), (t, q), (jnp.ones_like(t), u))
+    # h = d/dt (dT/dqdot) at qddot = 0, minus dT/dq
+    h = momentum_rate - jax.grad(kinetic_energy, argnums=2)(scene, t, q, u)
+    return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
+
+
+def speeds_are_rates(scene: Scene) -> bool:
+    """Return whether the speeds are the coordinates' own rates (no quaternions, no quasi-velocities)."""
+    return (
+        not scene.coordinates.quaternions
+        and scene.speeds is None
+        and type(scene).coordinate_rates is Scene.coordinate_rates
+    )

@@ -5,7 +5,7 @@
     inference  how well the minimum is known: covariance, intervals, densities, filters
     report     `Fit`: values, warnings, text and page
 
-A motion enters only through `solve/run_residuals.py`. Open `fit.py` first.
+A motion enters only through `solve/shooting.py`. Open `fit.py` first.
 """
 
 from jourdain_jax.identification.data.channels import Accelerometer, LoadCell
@@ -17,7 +17,7 @@ from jourdain_jax.identification.inference.log_density import LogDensity, log_de
 from jourdain_jax.identification.inference.planned_information import PlannedInformation, planned_information
 from jourdain_jax.identification.report.fit_result import Fit
 from jourdain_jax.identification.solve.body_inertia import possible_inertia
-from jourdain_jax.identification.solve.loss import huber, student_t
+from jourdain_jax.identification.solve.levenberg_marquardt import huber, student_t
 from jourdain_jax.identification.solve.shooting import MultipleShooting
 from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
 

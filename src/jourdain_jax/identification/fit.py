@@ -25,13 +25,12 @@ from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.reals import checked_whole, is_traced
 from jourdain_jax.identification.data.estimate import Estimate, Range
 from jourdain_jax.identification.data.experiment import Data, Experiment
+from jourdain_jax.identification.data.run_preparation import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.identification.inference.bound_limits import AtBounds, limits_at_bounds
-from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.identification.report.fit_result import Fit
 from jourdain_jax.identification.report.fit_statistics import statistics
 from jourdain_jax.identification.solve.body_inertia import PossibleInertia
-from jourdain_jax.identification.solve.levenberg_marquardt import Control, Minimum
-from jourdain_jax.identification.solve.loss import LEAST_SQUARES, Loss
+from jourdain_jax.identification.solve.levenberg_marquardt import LEAST_SQUARES, Control, Loss, Minimum
 from jourdain_jax.identification.solve.piecewise import Piecewise
 from jourdain_jax.identification.solve.problem import Asked, Problem, Span
 from jourdain_jax.identification.solve.shooting import MultipleShooting, check_shooting
@@ -39,7 +38,7 @@ from jourdain_jax.identification.solve.shooting_steps import cutoff_of, shot
 from jourdain_jax.identification.solve.unknowns import Unknowns, check_starts, unknowns_of
 from jourdain_jax.motion.options import OptionFields, Options
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.coordinates import as_names
 from jourdain_jax.scene.scene import Scene
 
 

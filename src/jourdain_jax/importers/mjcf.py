@@ -14,7 +14,7 @@ from jourdain_jax.importers.scene_class import identifier
 from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Matrix, Motor, Push, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Element, Part, XmlFile
-from jourdain_jax.scene.names import Labels, as_labels, nearest
+from jourdain_jax.scene.coordinates import Labels, as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _TYPES = ("free", "ball", "slide", "hinge")

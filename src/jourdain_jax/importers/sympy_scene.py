@@ -16,10 +16,8 @@ from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
 from jourdain_jax.importers.sympy_samples import affine, sampled, symbols_in
 from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_system
 from jourdain_jax.scene.bodies import Particle, RigidBody
-from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
+from jourdain_jax.scene.coordinates import check_names, coordinates, inputs, parameter, speeds
 from jourdain_jax.scene.loads import Load
-from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
 
 

@@ -9,16 +9,21 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Matrix3, Vector3, real_type
 from jourdain_jax.calculus.rotations import onto_axis, quaternion_to_matrix
-from jourdain_jax.importers.placement import combined
+from jourdain_jax.importers.mjcf_geoms import combined
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push, Tree
-from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
+from jourdain_jax.scene.bodies import RigidBody, Visual
+from jourdain_jax.scene.coordinates import (
+    Labels,
+    Quaternion,
+    check_names,
+    coordinates,
+    inputs,
+    parameter,
+    quaternion,
+)
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
-from jourdain_jax.scene.names import Labels, check_names
-from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 ROUNDED = 0.05  # tolerance, times the largest moment of inertia: some are published with two digits
 POINT = 1e-6**2  # m^2: moments of a smaller squared radius of gyration are round-off

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jourdain_jax.calculus.reals import checked_known
-from jourdain_jax.importers.placement import about
+from jourdain_jax.importers.mjcf_geoms import about
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
-from jourdain_jax.scene.names import Labels, as_labels, check_names, nearest
+from jourdain_jax.scene.coordinates import Labels, as_labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {

@@ -17,7 +17,7 @@ from jourdain_jax.calculus.files import FilePath, check_depth, number, parsed, r
 from jourdain_jax.calculus.reals import check_kind
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import Labels, as_labels, check_name, nearest
+from jourdain_jax.scene.coordinates import Labels, as_labels, check_name, nearest
 
 Element = ElementTree.Element
 LARGEST = 100_000_000  # bytes of the largest permitted file

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.roots import newton_root
-from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.dynamics.reactions import needs_work
 from jourdain_jax.equations.scene_parts import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, Solution, sizes

@@ -30,14 +30,13 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Scalar, Speeds, static
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
-from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.scene_parts import names_of_position_rows
-from jourdain_jax.equations.virtual_power import energies_at, resultants
+from jourdain_jax.equations.virtual_power import energies_at, resultants, speeds_are_rates
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.integrate.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.coordinates import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import gauge_of, loads_of
 from jourdain_jax.structure.structure import Structure, structure_of

@@ -21,7 +21,7 @@ from jourdain_jax.integrate.arrays.array_functions import joined
 from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.explicit_steps import Method, method_of
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.integrate.inputs import Inputs, Mode, Sampled, in_phases
+from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
 from jourdain_jax.integrate.loop import native_motion
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.handover import Start
@@ -30,12 +30,10 @@ from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import driven, may_jump
 from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved, Times
-from jourdain_jax.integrate.time_programs import FunctionOfTime
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
-from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
-from jourdain_jax.lowering.sides import with_sides
+from jourdain_jax.lowering.sides import loads_have_relations, loads_may_jump, with_sides
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.graph import ARRAYS
 from jourdain_jax.scene.scene import Scene

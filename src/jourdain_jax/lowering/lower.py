@@ -14,20 +14,24 @@ from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.equations.scene_parts import names_of_events, stops
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
-from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
-from jourdain_jax.lowering.comparison_probes import comparison_probes
+from jourdain_jax.lowering.comparison import (
+    agree,
+    check_against_dense,
+    comparison_probes,
+    rates_of,
+    values_at,
+)
 from jourdain_jax.lowering.distant_probes import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.relations import jumps, relations, sided
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import Probes, part_of
 from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
-from jourdain_jax.program.subgraph import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
-from jourdain_jax.scene.parameter_fields import parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.structure.trace import Variables, traced_scene

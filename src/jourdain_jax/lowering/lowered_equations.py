@@ -16,7 +16,7 @@ from jourdain_jax.lowering import export
 from jourdain_jax.program.derivative import differentiable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.trace import Variables
 

@@ -10,6 +10,11 @@ relation is the side of it on which the state is.
 The branch does not change within a step: the event search ends the step where x vanishes, and derivatives
 change there as at any event (`integrate/loop/transitions.py`). Modelica treats relations in the same way. If
 a branch is undefined beyond x = 0, as with `sqrt`, its relation has the event but not the mode.
+
+Detect kinks and jumps of loads and masses, from relations (`<`, `abs`, `floor`, ...) in the traced scene.
+No lowered program is needed.
+
+Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
 """
 
 from dataclasses import replace
@@ -19,9 +24,15 @@ from typing import Any
 import numpy as np
 
 from jourdain_jax.lowering.lowered_equations import NODES, Lowered
-from jourdain_jax.lowering.relations import COMPARED, WHOLE, counted, switches, where
-from jourdain_jax.program.graph import Graph, NodeList
-from jourdain_jax.structure.trace import Variables
+from jourdain_jax.lowering.relations import AGREE, COMPARED, WHOLE, branches, counted, jumps, switches, where
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph, NodeList, Unsupported
+from jourdain_jax.scene.identity import with_reference_parameters
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.probes import looked_at
+from jourdain_jax.structure.structure import structure_whatever_its_faults
+from jourdain_jax.structure.trace import TracedScene, Variables, named_values, owned
 
 
 @lru_cache(maxsize=64)
@@ -151,3 +162,66 @@ def _by_side(graph: Graph, op: str, args: NodeList, turned: int, side: int, numb
         "min": (args[0], args[-1]),
     }[op]
     return where(graph, graph.call("lt", sign, graph.zero), low, high)
+
+
+def loads_have_relations(scene: Scene) -> bool:
+    """Return whether relations decide between branches of loads or masses."""
+    traced = looked_at(scene).traced
+    return bool(switches(traced.graph, _loads(scene, traced)))
+
+
+def loads_may_jump(scene: Scene) -> bool:
+    """Return whether loads or masses jump at some state or parameter. Jumps at fixed times do not count,
+    because derivatives are correct there.
+    """
+    scene = with_reference_parameters(scene)
+    traced = looked_at(scene).traced
+    graph, loads = traced.graph, list(_loads(scene, traced))
+    moving = [
+        *traced.q.tolist(),
+        *traced.u.tolist(),
+        *(n for leaf in traced.parameters for n in leaf.ravel().tolist()),
+    ]
+    numbers = [n for n in switches(graph, loads) if depend_on(graph, [n], moving)[0]]
+    return bool(numbers) and bool(jumps(graph, numbers, loads, _probes(scene, traced)))
+
+
+def bent_load(scene: Scene, t, q, u, inputs) -> str:
+    """Return the name of a load or mass that has no derivative at this state; empty if all have one."""
+    try:
+        traced = looked_at(scene).traced
+    except Unsupported:
+        return ""
+    graph, named = traced.graph, _loads(scene, traced)
+    loads, numbers = list(named), switches(graph, named)
+    if not numbers:
+        return ""
+    at = np.concatenate([np.ravel(x).astype(float) for x in (q, u, inputs)])
+    # 1e-6 away from the state, relative for entries larger than one
+    step = np.diag(1e-6 * np.maximum(1.0, np.abs(at)))
+    q, u, inputs = np.split(
+        np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1
+    )
+    beside = Probes(graph, named_values(scene, t, q, u, inputs))
+    size, bent = np.nanmax(np.abs(_probes(scene, traced)(loads)), axis=1), np.zeros(len(loads), bool)
+    for number, nodes in numbers.items():
+        if not beside.sign(number):
+            above, below = branches(graph, nodes, loads)
+            bent |= np.any(np.abs(beside(above) - beside(below)) > AGREE * size[:, None], axis=1)
+    return named[loads[int(np.argmax(bent))]] if np.any(bent) else ""
+
+
+def _probes(scene: Scene, traced: TracedScene) -> Probes:
+    """Return probes at the states used to determine the scene's structure, with random speeds and inputs."""
+    known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
+    u, inputs = (
+        generator.normal(size=(len(known.times), len(names)))
+        for names in (scene.speed_names.entries, scene.inputs)
+    )
+    return Probes(traced.graph, named_values(scene, known.times, known.coordinates, u, inputs))
+
+
+def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
+    """Return the names of loads and masses, by node."""
+    names = "force", "torque", "mass", "inertia", "direct"
+    return owned(scene, **{name: getattr(traced.at, name) for name in names})

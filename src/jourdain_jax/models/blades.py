@@ -7,13 +7,10 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.calculus.vectors import vec
-from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.constraints import knife_edge, pin
-from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
-from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.parameter_fields import parameter
+from jourdain_jax.scene.bodies import RigidBody, Visual
+from jourdain_jax.scene.coordinates import coordinates, inputs, parameter, speeds
+from jourdain_jax.scene.loads import generalized_force, gravity, knife_edge, pin
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 
 class Skate(Scene):

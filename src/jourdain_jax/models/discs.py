@@ -10,8 +10,7 @@ from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact.contacts import disc_contact
-from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.parameter_fields import parameter
+from jourdain_jax.scene.coordinates import coordinates, parameter, quaternion
 
 
 class VerticalDisc(Heavy):

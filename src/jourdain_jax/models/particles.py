@@ -7,12 +7,10 @@ import jax.numpy as jnp
 from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
-from jourdain_jax.scene.bodies import Particle
+from jourdain_jax.scene.bodies import Particle, Visual
 from jourdain_jax.scene.contact.grounds import tangents_of
-from jourdain_jax.scene.coordinates import coordinates
-from jourdain_jax.scene.parameter_fields import parameter
+from jourdain_jax.scene.coordinates import coordinates, parameter
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 
 class _OnSheets(Scene):

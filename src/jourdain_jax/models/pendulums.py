@@ -9,14 +9,11 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
-from jourdain_jax.scene.bodies import Particle
-from jourdain_jax.scene.constraints import rod
-from jourdain_jax.scene.coordinates import coordinates
-from jourdain_jax.scene.loads import damper, gravity, spring
+from jourdain_jax.scene.bodies import Particle, Visual
+from jourdain_jax.scene.coordinates import coordinates, parameter
+from jourdain_jax.scene.loads import damper, gravity, rod, spring
 from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 
 class _DoublePendulum(Heavy):

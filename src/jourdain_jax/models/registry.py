@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from importlib import import_module
 
-from jourdain_jax.scene.names import Labels, check_name, nearest
+from jourdain_jax.scene.coordinates import Labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
 PLACES = {  # module -> names of its models; modules are imported on first use

@@ -8,12 +8,10 @@ from jourdain_jax.calculus.reals import Matrix3, Parameter, Vector3
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.calculus.vectors import vec
 from jourdain_jax.models.weight import Heavy
-from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.contact.contacts import ball_contact, ellipsoid_contact
 from jourdain_jax.scene.contact.grounds import Plane
-from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
-from jourdain_jax.scene.parameter_fields import parameter
-from jourdain_jax.scene.visuals import Visual
+from jourdain_jax.scene.coordinates import coordinates, parameter, quaternion, speeds
 
 
 class BallOnTurntable(Heavy):

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.parameter_fields import parameter
+from jourdain_jax.scene.coordinates import coordinates, parameter, quaternion
 from jourdain_jax.scene.scene import Scene
 
 

@@ -19,13 +19,11 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
-from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.contact.contacts import disc_contact
-from jourdain_jax.scene.coordinates import coordinates, speeds
+from jourdain_jax.scene.coordinates import coordinates, parameter, speeds
 from jourdain_jax.scene.loads import gravity
-from jourdain_jax.scene.parameter_fields import parameter
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 
 class _TwoWheelAxle(Scene):

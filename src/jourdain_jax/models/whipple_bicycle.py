@@ -22,14 +22,11 @@ from jaxtyping import Array
 from jourdain_jax.calculus.reals import Matrix3, Parameter, Scalar, Vector3, real_type
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.calculus.vectors import vec
-from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.contact.contacts import disc_contact
-from jourdain_jax.scene.coordinates import coordinates, inputs
+from jourdain_jax.scene.coordinates import Labels, check_name, coordinates, inputs, parameter, parameters_of
 from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.names import Labels, check_name
-from jourdain_jax.scene.parameter_fields import parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.visuals import Visual
 
 
 class WhippleBicycle(Scene):

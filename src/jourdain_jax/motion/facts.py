@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 
 
 @dataclass(frozen=True)

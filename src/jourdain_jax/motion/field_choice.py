@@ -4,7 +4,7 @@ from typing import Any
 
 from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
-from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.dynamics.reactions import needs_work
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.scene_parts import names_of_events, names_of_position_rows, stops
 from jourdain_jax.integrate.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
@@ -16,7 +16,7 @@ from jourdain_jax.integrate.vector_fields.field import (
 )
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered_equations import Lowered
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.coordinates import check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import WELL_CONDITIONED, Structure, structure_of, trust
 

@@ -20,12 +20,11 @@ from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
-from jourdain_jax.integrate.inputs import Inputs, Mode, in_phases
+from jourdain_jax.integrate.inputs import Inputs, Mode, for_programs, in_phases
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
-from jourdain_jax.integrate.time_programs import for_programs
 from jourdain_jax.integrate.vector_fields.field import ByProgram
 from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.motion.drift import (
@@ -38,8 +37,8 @@ from jourdain_jax.motion.drift import (
 )
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases
+from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.structure.plausibility import faults_at
 from jourdain_jax.structure.row_program import row_program
 

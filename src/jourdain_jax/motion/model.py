@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 
 from jourdain_jax.calculus.files import FilePath
-from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.dynamics.reactions import needs_work
 from jourdain_jax.equations.scene_parts import names_of_events, names_of_invariants
 from jourdain_jax.integrate.constraint_projection import Usual, usual_sizes
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
@@ -24,8 +24,8 @@ from jourdain_jax.motion.facts import Conserved, Dependence, Freedoms, Rows
 from jourdain_jax.motion.field_choice import vector_field_of
 from jourdain_jax.motion.options import bytes_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.coordinates import Labels, Sentences
 from jourdain_jax.scene.identity import found_before, once_per_values
-from jourdain_jax.scene.names import Labels, Sentences
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.probes import coordinates_on_rows

@@ -23,7 +23,7 @@ from jourdain_jax.calculus.reals import (
 from jourdain_jax.integrate.explicit_steps import Method, Taylor, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.scene.arguments import BuiltFor
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.coordinates import nearest
 
 if TYPE_CHECKING:
     from jourdain_jax.integrate.vector_fields.field import Formulation

@@ -25,7 +25,7 @@ from jourdain_jax.calculus.reals import all_finite, at_index, known_numbers
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.discrete_gradient import DiscreteGradient
 from jourdain_jax.integrate.explicit_steps import DOPRI8, Taylor
-from jourdain_jax.integrate.radau import RadauIIA
+from jourdain_jax.integrate.implicit_steps import RadauIIA
 from jourdain_jax.integrate.setup import Setup
 from jourdain_jax.integrate.vector_fields.field import Instant, VectorField, as_formulation
 from jourdain_jax.motion.options import AllOptions

@@ -28,10 +28,9 @@ from jourdain_jax.calculus.reals import (
 )
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.explicit_steps import Taylor
-from jourdain_jax.integrate.inputs import as_inputs, check_inputs_in_rows
+from jourdain_jax.integrate.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.integrate.setup import MEMORY
 from jourdain_jax.integrate.state_projection import State
-from jourdain_jax.integrate.time_programs import for_programs
 from jourdain_jax.integrate.vector_fields.field import VectorField
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.model import modelled
@@ -43,8 +42,7 @@ from jourdain_jax.motion.trajectories import labels
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time, shown_from_users_lines
-from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import check_names, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.structure.structure import Reference

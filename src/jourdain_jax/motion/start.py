@@ -52,7 +52,7 @@ from jourdain_jax.scene.arguments import (
     one_time,
     shown_from_users_lines,
 )
-from jourdain_jax.scene.names import Labels, check_names, nearest
+from jourdain_jax.scene.coordinates import Labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.sampling import guesses_of
 from jourdain_jax.structure.structure import structure_of

@@ -19,8 +19,7 @@ import numpy as np
 
 from jourdain_jax.calculus.derivatives import is_zero
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.program.emit import run
-from jourdain_jax.program.fused_loop import fused
+from jourdain_jax.program.emit import fused, run
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList, Unsupported
 
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from operator import and_
 
+from jourdain_jax.program.evaluate import more_operations
 from jourdain_jax.program.graph import ARRAYS, Graph, NodeList
-from jourdain_jax.program.subgraph import more_operations
 
 Monomial = tuple[int, ...]  # atoms in order, repeated by their power
 Polynomial = dict[Monomial, float]

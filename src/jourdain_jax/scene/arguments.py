@@ -34,7 +34,7 @@ from jourdain_jax.calculus.reals import (
     is_traced,
     real_type,
 )
-from jourdain_jax.scene.names import Labels, check_names
+from jourdain_jax.scene.coordinates import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 
 F = TypeVar("F", bound=Callable)

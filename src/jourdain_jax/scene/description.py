@@ -13,9 +13,8 @@ import numpy as np
 
 from jourdain_jax.calculus.code import functions_in, names_in
 from jourdain_jax.calculus.reals import all_finite, check_kind, has_unit, known_numbers
-from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.coordinates import Names, as_names, check_names
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.names import as_names, check_names
 
 METHODS = (
     "bodies",

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import all_finite, is_traced_type, largest
-from jourdain_jax.scene.parameter_fields import stacked_parameters
+from jourdain_jax.scene.coordinates import stacked_parameters
 
 
 def clear_caches() -> None:

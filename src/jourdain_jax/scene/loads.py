@@ -5,17 +5,42 @@ A load has forces F at the mass centres (`forces`), torques L (`torques`), and g
 speeds u_k (`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a
 `potential` is conservative, and its potential is part of the potential energy V. The work of other loads is
 integrated along the motion.
+
+Ready-made constraints.
+
+Each function returns a value that is zero while the constraint holds. A geometric constraint is a function of
+a `Pose`; return it by name from `geometric_constraints` of a scene. The engine differentiates it with respect
+to time. A velocity constraint is a function of a `Motion`; return it by name from `velocity_constraints`.
+
+Velocity constraints that hold until their force exceeds a limit: friction in joints, and blades that may
+slip sideways.
+
+    w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        w: slip,  L: constraint force, N or N m
+
+Each is treated as a contact with friction, whose normal force is one newton and whose coefficients of
+friction are the forces F. It then has the modes, events and derivatives of contacts (`equations/phases.py`).
 """
 
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Vector3, check_kind, checked_real, described
-from jourdain_jax.scene.motion_state import Motion, Point
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.calculus.reals import (
+    Number,
+    Scalar,
+    Vector,
+    Vector3,
+    check_kind,
+    checked_positive,
+    checked_real,
+    described,
+)
+from jourdain_jax.calculus.rotations import vee
+from jourdain_jax.scene.contact.contacts import Coulomb
+from jourdain_jax.scene.coordinates import check_names
+from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point
 
 
 class Load(eqx.Module):
@@ -171,3 +196,125 @@ def _between(a: Point, b: Point, pull, potential) -> Load:
         return Load(potential=potential)  # internal forces of a rigid body do no virtual power
     first, second = _on_point(a, pull), _on_point(b, -pull)
     return Load(first.forces | second.forces, first.torques | second.torques, {}, potential)
+
+
+class HeldRow(eqx.Module):
+    """A velocity constraint `w` = 0 (m/s, rad/s) that holds until its force exceeds `friction` (N, N m)."""
+
+    w: Scalar
+    friction: Coulomb
+
+    def __init__(self, w: Any, friction: Any, what: str):
+        self.w = w
+        known = isinstance(friction, Coulomb)
+        self.friction = friction if known else Coulomb(checked_real(friction, f"friction of {what}", ()))
+
+    @property
+    def slip(self) -> Float[Array, "2"]:
+        """Return the slip in the form of contacts, with two tangents; the second entry is zero."""
+        return jnp.stack([self.w, jnp.zeros_like(self.w)])
+
+
+class JointFriction(Load):
+    """Friction on speeds. Each speed has a constraint that holds until its force exceeds a limit."""
+
+    rows: dict[str, HeldRow]
+
+    def __init__(self, rows: dict[str, HeldRow]):
+        super().__init__()
+        self.rows = rows
+
+
+def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
+    """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`.
+
+    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
+      static)` with two forces.
+
+    The force Q on a speed u is `-F u/|u|`. A speed of zero stays zero as long as a force with `|Q| <= F` can
+    hold it. `motion.phase("hinge_rate")` returns whether the speed holds or slips. Raises ValueError for an
+    unknown speed.
+
+    **Examples**
+
+        def loads(self, motion):
+            return jj.gravity(motion, 9.81), jj.joint_friction(motion, angle_rate=self.stiction)
+    """
+    check_names(friction, motion.u.keys(), "friction on unknown speed `{}`")
+    return JointFriction(
+        {name: HeldRow(motion.u[name], force, f"`{name}`") for name, force in friction.items()}
+    )
+
+
+def held_rows(constraints: Any, loads: Any) -> dict[str, HeldRow]:
+    """Return the constraints with a force limit, by name, among results of `velocity_constraints`
+    and `loads`.
+    """
+    found = {name: row for name, row in dict(constraints).items() if isinstance(row, HeldRow)}
+    for load in (loads,) if isinstance(loads, Load) else loads:
+        found |= load.rows if isinstance(load, JointFriction) else {}
+    return found
+
+
+def _point(position: Vector, what: str) -> Vector3:
+    return checked_real(position, what, (3,), advice="give three components in the inertial frame, m")
+
+
+def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector, *, holds: Any = None) -> Scalar | HeldRow:
+    """Return the velocity constraint of a blade or skate, `v(contact) . lateral` in m/s, eq. (7): the point
+    of `body` at `contact` does not move along `lateral`.
+
+    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. The
+      body axis y is `body.orientation[:, 1]`, a column.
+    - `holds`: the largest sideways force F in N, a number or a function of the motion, or
+      `jj.Coulomb(sliding, static)` with two forces. If the constraint needs a larger force, the blade slips,
+      opposed by F, until its sideways velocity is zero again (`motion.phase`). None: the blade never slips.
+    """
+    what = f"the knife edge of `{body.name}`"
+    contact = _point(contact, f"contact of {what}")
+    lateral = checked_real(lateral, f"lateral direction of {what}", (3,), advice="give a unit vector")
+    w = body.velocity_at(contact) @ lateral
+    return w if holds is None else HeldRow(w, holds, what)
+
+
+def rod(a: Vector, b: Vector, length: Number) -> Scalar:
+    """Return the geometric constraint of a massless rod of the given `length` (m) between two points `a`, `b`
+    (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m. Eq. (5).
+
+    To first order the value is the excess length. The multiplier is the thrust in the rod (N, positive in
+    compression). The value is smooth even where the points coincide.
+    """
+    apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
+    length = checked_positive(
+        length, "length of a rod", advice="give it in m; to keep two points together use `jj.pin`"
+    )
+    return (apart @ apart - length**2) / (2 * length)
+
+
+def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
+    """Return the geometric constraints `b - a` of a joint that keeps two points `a`, `b` (m,
+    inertial frame) together. Eq. (5).
+
+    `axes`: letters of the constrained inertial axes (`"xy"` in a plane). Raises ValueError for other letters.
+    """
+    if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
+        raise ValueError(f"`axes` of a pin is `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
+    apart = _point(b, "second point of a pin") - _point(a, "first point of a pin")
+    return apart[jnp.array(["xyz".index(axis) for axis in axes])]
+
+
+def weld(
+    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None
+) -> Float[Array, "6"]:
+    """Return the geometric constraints (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
+
+    The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide. The orientations R
+    satisfy `R_second = R_first turn`, with the rotation matrix `turn` (3, 3), by default the identity. The
+    rotation constraints are `vee(turn' R_first' R_second)`, to first order the vector of the excess rotation.
+    """
+    for body, which in ((first, "first"), (second, "second")):
+        check_kind(body, BodyPose, f"the {which} body of a weld", 'the pose of a body; write pose["name"]')
+    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else turn
+    turn = checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
+    apart = second.place(at_second) - first.place(at_first)
+    return jnp.concatenate([apart, vee(turn.T @ first.orientation.T @ second.orientation)])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, described, is_traced
-from jourdain_jax.scene.names import Labels, check_name, nearest
+from jourdain_jax.scene.coordinates import Labels, check_name, nearest
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Scalar, checked_real, static
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
-from jourdain_jax.scene.names import Named, UnknownNameError, check_name
+from jourdain_jax.scene.coordinates import Named, UnknownNameError, check_name
 
 Vectors = Float[Array, "*times 3"]
 

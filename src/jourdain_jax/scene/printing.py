@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import eps_of, is_traced
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 
 
 class Printed:

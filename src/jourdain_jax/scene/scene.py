@@ -27,7 +27,7 @@ from jourdain_jax.calculus.reals import (
     known_numbers,
     real_type,
 )
-from jourdain_jax.scene.bodies import Body
+from jourdain_jax.scene.bodies import Body, Visual
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.contact.friction_contacts import (
     NONE_SWITCHES,
@@ -36,17 +36,21 @@ from jourdain_jax.scene.contact.friction_contacts import (
     has_friction,
     switching_of,
 )
-from jourdain_jax.scene.contact.held_rows import HeldRow
-from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.coordinates import (
+    Coordinates,
+    Labels,
+    Named,
+    Names,
+    check_parameters,
+    nearest,
+    parameters_of,
+)
 from jourdain_jax.scene.description import check_description, checked_arguments
-from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.loads import HeldRow, Load
 from jourdain_jax.scene.modes import Event, Modes
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Labels, Named, nearest
 from jourdain_jax.scene.outside_names import NamesRead, is_function, names_read
-from jourdain_jax.scene.parameter_fields import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
-from jourdain_jax.scene.visuals import Visual
 
 
 class Scene(eqx.Module):

@@ -12,15 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Scalar, Shape, check_kind, checked_real, described
-from jourdain_jax.scene.bodies import Body
+from jourdain_jax.scene.bodies import Body, Visual
 from jourdain_jax.scene.contact.contacts import Contact
-from jourdain_jax.scene.contact.held_rows import HeldRow, JointFriction, held_rows
-from jourdain_jax.scene.loads import Gravity, Load
+from jourdain_jax.scene.coordinates import Named, check_names, nearest
+from jourdain_jax.scene.loads import Gravity, HeldRow, JointFriction, Load, held_rows
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Named, check_names, nearest
 from jourdain_jax.scene.scene import Scene, state_names
-from jourdain_jax.scene.visuals import Visual
 
 _VANISH = "return numbers that vanish if the constraint holds"
 

@@ -3,5 +3,5 @@ time dependence.
 
 Every decision about how a scene is computed uses these facts; higher packages do not determine them again.
 Open `structure.py` first; `probes.py` evaluates the graph at states of the domain, `assembly.py` projects
-them onto the constraints, `probe_findings.py` decides which quantities vanish.
+them onto the constraints, `rank.py` decides which quantities vanish.
 """

@@ -30,7 +30,7 @@ from jourdain_jax.equations.instant import derivatives_in_speeds
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, pose_at
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.names import Sentences
+from jourdain_jax.scene.coordinates import Sentences
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import random_states
 from jourdain_jax.structure.scene_numbers import Numbers, numbers_of, stated_of

@@ -15,11 +15,11 @@ import numpy as np
 from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.evaluate import part_of
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
-from jourdain_jax.program.subgraph import part_of
+from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
-from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import (
     BY_ROWS,

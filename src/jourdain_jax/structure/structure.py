@@ -19,31 +19,29 @@ from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, i
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
 from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
-from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import speed_scales, typical_row_lengths
 from jourdain_jax.structure.plausibility import sentences
-from jourdain_jax.structure.probe_findings import (
+from jourdain_jax.structure.probes import TIMED, follow_from_others
+from jourdain_jax.structure.rank import (
     RANDOM_PROBES,
     at_probes,
+    best_privileged,
+    contradictions,
     exceeds,
     far_rows,
     is_singular,
     moves,
-    no_inertia,
-    sizes,
-    speed_terms,
-)
-from jourdain_jax.structure.probes import TIMED, follow_from_others
-from jourdain_jax.structure.rank import (
-    best_privileged,
-    contradictions,
     named_speeds,
+    no_inertia,
     pivots_at,
     ranks_of,
     redundant_rows,
     scaled_states,
+    sizes,
+    speed_terms,
     worst_pivot,
 )
 from jourdain_jax.structure.sampling import drawn_states, no_numbers, usable_states

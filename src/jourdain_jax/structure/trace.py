@@ -25,9 +25,8 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
-from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, of_bodies, velocities_of
-from jourdain_jax.equations.phases import contact_changes, contact_events, contacts_at_start, put_back
+from jourdain_jax.equations.phases import At, contact_changes, contact_events, contacts_at_start, put_back
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.scene_parts import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.virtual_power import (
@@ -38,9 +37,9 @@ from jourdain_jax.equations.virtual_power import (
     resultants,
     slip_turns,
 )
+from jourdain_jax.program.calls import interpret_with_calls
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
-from jourdain_jax.program.opaque_calls import interpret_with_calls
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion

@@ -1,12 +1,10 @@
 """Studies of many motions: designs, runs that survive interruption, storage, statistics, Sobol' indices.
 
-`study.py` -> `design.py` -> `task.py` (one block of samples) -> `run.py` -> `store.py`. Files on disk keep
+`study.py` -> `design.py` -> `outputs.py` (one block of samples) -> `run.py` -> `store.py`. Files on disk keep
 their format between versions. Open `study.py` first.
 """
 
-from jourdain_jax.studies.design import Design
-from jourdain_jax.studies.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-from jourdain_jax.studies.folder_lock import InUseError
+from jourdain_jax.studies.design import Design, Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.studies.mean_gradients import MeanGradients
 from jourdain_jax.studies.outputs import (
     End,
@@ -18,8 +16,9 @@ from jourdain_jax.studies.outputs import (
     Quantity,
     Smallest,
 )
+from jourdain_jax.studies.records import InUseError
 from jourdain_jax.studies.result import StudyResult, merge_studies
-from jourdain_jax.studies.sobol import SobolIndices, sobol_indices
+from jourdain_jax.studies.statistics import SobolIndices, sobol_indices
 
 __all__ = [
     "Design",

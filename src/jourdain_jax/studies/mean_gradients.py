@@ -24,12 +24,10 @@ from jourdain_jax.integrate import result_codes
 from jourdain_jax.motion.rollout import rollout
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import Labels, check_name, nearest
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import Labels, check_name, nearest, parameters_of
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.studies.distributions import Distribution
-from jourdain_jax.studies.outputs import OfEvent
-from jourdain_jax.studies.task import Task
+from jourdain_jax.studies.design import Distribution
+from jourdain_jax.studies.outputs import OfEvent, Task
 
 SHIFT = "shift"  # a common shift of all values of a table column, or of all levels of a grid
 

@@ -15,12 +15,11 @@ from jourdain_jax.integrate.result_codes import CODES
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.names import Labels, check_name
+from jourdain_jax.scene.coordinates import Labels, check_name
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.studies.sobol import SobolIndices, sobol_indices
-from jourdain_jax.studies.statistics import Grid, Statistics, Tally, combined
+from jourdain_jax.studies.outputs import Task
+from jourdain_jax.studies.statistics import Grid, SobolIndices, Statistics, Tally, combined, sobol_indices
 from jourdain_jax.studies.store import Store
-from jourdain_jax.studies.task import Task
 
 LEVELS = (0.025, 0.5, 0.975)
 

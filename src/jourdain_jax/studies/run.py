@@ -27,11 +27,11 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.rollout import rollout
 from jourdain_jax.motion.trajectories.labels import OF_LANES
 from jourdain_jax.scene.arguments import warn
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.studies import memory
+from jourdain_jax.studies.outputs import Task
 from jourdain_jax.studies.statistics import Grid, Tally
 from jourdain_jax.studies.store import Store
-from jourdain_jax.studies.task import Task
 
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
 

@@ -31,7 +31,6 @@ import numpy as np
 from jourdain_jax.calculus.files import FilePath, name_of, parsed, read_bytes, shortened, write_whole
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.studies.design import MOST_SAMPLES
-from jourdain_jax.studies.folder_lock import locked
 from jourdain_jax.studies.records import (
     GRID,
     MANIFEST,
@@ -39,6 +38,7 @@ from jourdain_jax.studies.records import (
     crc32c,
     digest,
     digest_of,
+    locked,
     with_checksum,
     write_manifest,
 )

@@ -13,19 +13,15 @@ from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import span_and_times
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.names import check_name
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import check_name, parameters_of
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.studies.cluster import on_cluster
-from jourdain_jax.studies.design import MOST_SAMPLES, Design
-from jourdain_jax.studies.distributions import Distribution, Levels
+from jourdain_jax.studies.design import MOST_SAMPLES, Design, Distribution, Levels
 from jourdain_jax.studies.mean_gradients import MeanGradients, mean_gradients
 from jourdain_jax.studies.memory import of_each
-from jourdain_jax.studies.outputs import Integral, as_outputs
+from jourdain_jax.studies.outputs import AT_START, SAVES, Integral, Task, as_outputs
 from jourdain_jax.studies.result import StudyResult
 from jourdain_jax.studies.run import bounded, in_this_process, run
-from jourdain_jax.studies.task import AT_START, SAVES, Task
-from jourdain_jax.studies.workers import in_processes
+from jourdain_jax.studies.workers import in_processes, on_cluster
 
 _STATED = "give saved times as `ts`; `outputs` and `save` choose the stored results"
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)

@@ -8,9 +8,8 @@ import numpy as np
 from jourdain_jax.calculus.reals import largest
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.visuals import Visual
-from jourdain_jax.views.ground_shapes import grounds_of
-from jourdain_jax.views.looks import Drawn, DrawnBody, looks_of
+from jourdain_jax.scene.bodies import Visual
+from jourdain_jax.views.looks import Drawn, DrawnBody, grounds_of, looks_of
 from jourdain_jax.views.solids import radius_of, triangles_of
 
 

@@ -14,7 +14,7 @@ from jourdain_jax.integrate import result_codes
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
+from jourdain_jax.scene.coordinates import Labels, UnknownNameError, check_name
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 UNITS = {  # size in SI units, by kind of quantity

@@ -15,7 +15,7 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.coordinates import check_names
 from jourdain_jax.views.page_data import Display, page_data
 
 

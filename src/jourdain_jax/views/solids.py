@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.calculus.rotations import onto_axis
-from jourdain_jax.scene.visuals import Visual
+from jourdain_jax.scene.bodies import Visual
 
 Quads = Float[np.ndarray, "faces 4 3"]  # m; corners counterclockwise as seen from outside
 

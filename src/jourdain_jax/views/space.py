@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.figures import pyplot
-from jourdain_jax.views.ground_shapes import floor_under
-from jourdain_jax.views.looks import Drawn
+from jourdain_jax.views.looks import Drawn, floor_under
 from jourdain_jax.views.solids import Quads, faces_of, split
 
 Painted = tuple[Quads, Float[np.ndarray, "faces 4"]]  # faces in space, and their red, green, blue and opacity

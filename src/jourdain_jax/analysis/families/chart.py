@@ -15,7 +15,7 @@ from jourdain_jax.analysis.families.family import Family, family
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Number, Scalar
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
-from jourdain_jax.scene.names import check_names
+from jourdain_jax.scene.coordinates import check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 

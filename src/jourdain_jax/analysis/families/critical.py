@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyEquations
+from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyEquations, null_space
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special_program import SpecialProgram, program_of
-from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.families.equations import Look, Motions, Vector
-from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
+from jourdain_jax.analysis.families.equations import Look, Modes, Motions, Vector, matched, surely_matched
 from jourdain_jax.calculus.reals import all_finite, largest
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import parameters_of
 
 Targets = list[tuple[int, float]]  # indices of unknowns, and their values at which a curve ends
 CLOSED = "the curve is closed"

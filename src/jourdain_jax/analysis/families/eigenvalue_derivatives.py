@@ -11,15 +11,13 @@ import numpy as np
 from jaxtyping import Array, Complex
 
 from jourdain_jax.analysis.families.critical import FOUND, MEANINGS, SINGULAR
-from jourdain_jax.analysis.families.equations import Look, SteadyEquations, numbered
+from jourdain_jax.analysis.families.equations import Look, SteadyEquations, null_space, numbered
 from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.analysis.families.special_program import program_of
-from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.calculus.reals import largest, static
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import Labels, as_names
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import Labels, as_names, parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, table
 from jourdain_jax.scene.scene import Scene
 

@@ -7,6 +7,8 @@ which no equation depends, such as a heading, are omitted. Unknowns are in units
 units. Small motions about a steady motion:
 
     x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: basis of C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
+
+Match eigenvalues of small motions along a family, so that each column follows one mode.
 """
 
 from abc import ABC, abstractmethod
@@ -15,15 +17,61 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
-from jourdain_jax.analysis.families.spectrum import Modes, null_space
 from jourdain_jax.analysis.motion_derivatives import by_program, numbers_of, on_rows, places_of
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.lazy_imports import module_on_first_use
+from jourdain_jax.calculus.reals import Scalar, largest
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.scene.names import Labels, check_name
+from jourdain_jax.scene.coordinates import Labels, check_name
 from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.structure.assembly import coordinate_bounds
+
+optimize = module_on_first_use("scipy.optimize")
+Modes = Complex[np.ndarray, "modes"]
+
+
+def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states free"]:
+    """Return an orthonormal basis of the null space of C."""
+    _, sigma, V = np.linalg.svd(C)
+    return V[np.sum(sigma > 1e-9 * np.max(sigma, initial=1e-300)) :].T
+
+
+def matched(before: Modes, now: Modes) -> Modes:
+    """Return the eigenvalues in the order of their predecessors: the assignment with the smallest total
+    change.
+    """
+    apart, place = np.abs(before[:, None] - now), np.arange(len(now))
+    return now[optimize.linear_sum_assignment(apart - 1e-12 * (1 + largest(now)) * np.outer(place, place))[1]]
+
+
+def surely_matched(before: Modes, now: Modes) -> bool:
+    """Return whether each eigenvalue moved by at most half of its distance to the nearest other eigenvalue.
+    Its complex conjugate does not count as another.
+    """
+    columns = range(len(now))
+    beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
+    apart = np.where(beside, np.inf, np.abs(before[:, None] - before))
+    return bool(np.all(np.abs(now - before) <= 0.5 * np.min(apart, axis=1, initial=np.inf)))
+
+
+def are_partners(before, now, k: int, j: int) -> bool:
+    """Return whether two columns are a complex conjugate pair before or now."""
+    return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
+
+
+def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:
+    """Return the names of the columns: `names` if given, otherwise the scene's, otherwise "mode 1", ..."""
+    named = getattr(scene, "mode_names", None)
+    names = (
+        tuple(names)
+        if names is not None
+        else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
+    )
+    if len(names) != len(values):
+        raise ValueError(f"`names` has {len(names)} names, expected one for each of the {len(values)} modes")
+    return names
+
 
 Vector = Float[np.ndarray, "unknowns"]
 PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"

@@ -10,10 +10,9 @@ from jaxtyping import Bool, Complex, Float
 
 from jourdain_jax.analysis.families.continuation import across, first_point, followed, special
 from jourdain_jax.analysis.families.curve import CLOSED, Point, located
-from jourdain_jax.analysis.families.equations import Motions, SteadyEquations, Vector
+from jourdain_jax.analysis.families.equations import Modes, Motions, SteadyEquations, Vector, mode_names
 from jourdain_jax.analysis.families.periodic import OrbitEquations, PeriodicMotion
 from jourdain_jax.analysis.families.special_points import SURE
-from jourdain_jax.analysis.families.spectrum import Modes, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest
@@ -26,8 +25,14 @@ from jourdain_jax.scene.arguments import (
     of_known_numbers,
     shown_from_users_lines,
 )
-from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_name, check_names
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import (
+    Labels,
+    UnknownNameError,
+    as_names,
+    check_name,
+    check_names,
+    parameters_of,
+)
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
 

@@ -15,7 +15,7 @@ from jourdain_jax.integrate.inputs import Inputs, inputs_at
 from jourdain_jax.integrate.state_projection import state_of
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import structure_of
 from jourdain_jax.structure.trace import event_values

@@ -26,10 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex
 
-from jourdain_jax.analysis.families.equations import Look, Motions, Vector
+from jourdain_jax.analysis.families.equations import Look, Modes, Motions, Vector
 from jourdain_jax.analysis.families.multiple_shooting import Shooting, Unknowns
 from jourdain_jax.analysis.families.special_points import SURE
-from jourdain_jax.analysis.families.spectrum import Modes
 from jourdain_jax.analysis.motion_derivatives import instant_of, unseen
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
@@ -51,7 +50,7 @@ from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import Labels, as_names, check_name, check_names
+from jourdain_jax.scene.coordinates import Labels, as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed, complex_numbers
 from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.structure.structure import structure_of

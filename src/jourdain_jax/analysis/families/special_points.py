@@ -17,8 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from jourdain_jax.analysis.families.curve import Point
-from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector
-from jourdain_jax.analysis.families.spectrum import are_partners
+from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector, are_partners
 
 SURE = 1e-7  # real parts and differences of eigenvalues above SURE (1 + |s|) are not round-off
 

@@ -49,9 +49,9 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.scene_parts import names_of_events
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
+from jourdain_jax.scene.coordinates import check_name, nearest
 from jourdain_jax.scene.identity import once_per_class, once_per_values
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.outside_names import now_read_by
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.sampling import sample_states

@@ -1,8 +1,8 @@
 """Uncertainty of a fit, and densities of the same runs.
 
     information, planned_information    covariance of a fit, and of a plan
-    standard_errors, noise_levels       intervals, and sigmas that are estimated
-    profile_likelihood, bound_limits    intervals by profiles, and at bounds
+    standard_errors                     intervals, and sigmas that are estimated
+    bound_limits                        intervals by profiles, and at bounds
     likelihood, log_density, filtering, correlated_noise    densities of measurements
 
 Open `information.py` first.

@@ -31,12 +31,11 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.identification.data.channels import Channel, Instrument, StopEvent
 from jourdain_jax.identification.data.delay_filter import gauss_legendre
 from jourdain_jax.identification.data.estimate import Correlated, Estimate
-from jourdain_jax.identification.data.experiment import Data, Experiment
-from jourdain_jax.identification.data.responses import ideal
-from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, check_known
+from jourdain_jax.identification.data.experiment import Data, Experiment, ideal
+from jourdain_jax.identification.data.run_preparation import as_fit_options, as_runs, check_known
 from jourdain_jax.identification.inference.likelihood import mapped
 from jourdain_jax.identification.solve.run_groups import equal_runs
-from jourdain_jax.identification.solve.run_residuals import Run
+from jourdain_jax.identification.solve.shooting import Run
 from jourdain_jax.integrate.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
@@ -44,7 +43,7 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import Labels, nearest
+from jourdain_jax.scene.coordinates import Labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _NODES, _WEIGHTS = gauss_legendre(5)

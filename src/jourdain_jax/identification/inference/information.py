@@ -40,7 +40,7 @@ from scipy.special import stdtrit
 from jourdain_jax.calculus.reals import described, largest, real_type
 from jourdain_jax.identification.solve.arrow import Arrow
 from jourdain_jax.identification.solve.layout import Layout
-from jourdain_jax.scene.names import Labels, Sentences
+from jourdain_jax.scene.coordinates import Labels, Sentences
 from jourdain_jax.scene.scene import Scene
 
 

@@ -14,10 +14,10 @@ from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.identification.data.experiment import Data
+from jourdain_jax.identification.data.run_preparation import as_fit_options, as_runs, check_known
 from jourdain_jax.identification.inference.correlated_noise import log_densities
-from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, check_known
 from jourdain_jax.identification.solve.run_groups import equal_runs
-from jourdain_jax.identification.solve.run_residuals import Run
+from jourdain_jax.identification.solve.shooting import Run
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene

@@ -24,20 +24,20 @@ from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Scalar, holds, is_traced, real_type, static
 from jourdain_jax.identification.data.estimate import Estimate, Range, positive
 from jourdain_jax.identification.data.experiment import Data
+from jourdain_jax.identification.data.run_preparation import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.identification.inference.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.identification.inference.likelihood import mapped, of_run, of_samples
 from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.solve.body_inertia import PossibleInertia
 from jourdain_jax.identification.solve.layout import Layout
 from jourdain_jax.identification.solve.run_groups import equal_runs
-from jourdain_jax.identification.solve.run_residuals import Run
+from jourdain_jax.identification.solve.shooting import Run
 from jourdain_jax.identification.solve.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.coordinates import Labels, check_names
 from jourdain_jax.scene.identity import reference_parameters
-from jourdain_jax.scene.names import Labels, check_names
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference
 

@@ -21,17 +21,17 @@ from jourdain_jax.calculus.compilation import compiled
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, is_traced, static
 from jourdain_jax.identification.data.estimate import Estimate, Range
 from jourdain_jax.identification.data.experiment import Data, Experiment
-from jourdain_jax.identification.inference.fit_arguments import as_fit_options, as_runs
+from jourdain_jax.identification.data.run_preparation import as_fit_options, as_runs
 from jourdain_jax.identification.inference.information import hidden_combinations
 from jourdain_jax.identification.solve.body_inertia import PossibleInertia
 from jourdain_jax.identification.solve.layout import Layout, Place
-from jourdain_jax.identification.solve.run_residuals import Run, run_of
+from jourdain_jax.identification.solve.shooting import Run, run_of
 from jourdain_jax.identification.solve.unknowns import Unknowns, unknowns_of
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.coordinates import Labels, UnknownNameError, as_names, check_names
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import Labels, UnknownNameError, as_names, check_names
 from jourdain_jax.scene.printing import Printed, table
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference

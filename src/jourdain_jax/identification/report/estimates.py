@@ -20,8 +20,7 @@ from jourdain_jax.identification.report.fit_statistics import Counts, PerRepeat,
 from jourdain_jax.identification.solve.piecewise import Shot
 from jourdain_jax.identification.solve.problem import Asked
 from jourdain_jax.identification.solve.unknowns import Unknowns
-from jourdain_jax.scene.names import Sentences, UnknownNameError, check_name, nearest
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import Sentences, UnknownNameError, check_name, nearest, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import impossible_bodies

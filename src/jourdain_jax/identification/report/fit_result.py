@@ -10,8 +10,7 @@ from jourdain_jax.identification.data.experiment import Data, Experiment
 from jourdain_jax.identification.inference.log_density import log_density
 from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.report.fit_page import fit_page, interval_widths
-from jourdain_jax.identification.report.fit_text import batch_text, text
-from jourdain_jax.identification.report.fit_warnings import warnings_of
+from jourdain_jax.identification.report.fit_text import batch_text, text, warnings_of
 from jourdain_jax.identification.report.resumed_fit import (
     Prediction,
     Profile,
@@ -21,8 +20,8 @@ from jourdain_jax.identification.report.resumed_fit import (
     profiles,
     taken_up,
 )
-from jourdain_jax.identification.solve.loss import LEAST_SQUARES
-from jourdain_jax.scene.names import Sentences, as_names
+from jourdain_jax.identification.solve.levenberg_marquardt import LEAST_SQUARES
+from jourdain_jax.scene.coordinates import Sentences, as_names
 
 
 class Fit(Estimates):

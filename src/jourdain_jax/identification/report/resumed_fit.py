@@ -37,16 +37,16 @@ from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import largest
 from jourdain_jax.identification.data.experiment import Data, Experiment
-from jourdain_jax.identification.inference.fit_arguments import as_runs
+from jourdain_jax.identification.data.run_preparation import as_runs
+from jourdain_jax.identification.inference.bound_limits import side
 from jourdain_jax.identification.inference.information import information
-from jourdain_jax.identification.inference.profile_likelihood import side
 from jourdain_jax.identification.inference.standard_errors import RISE_95
 from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.solve.levenberg_marquardt import Minimum
 from jourdain_jax.identification.solve.piecewise import Piecewise
 from jourdain_jax.identification.solve.problem import Asked, Problem
 from jourdain_jax.identification.solve.unknowns import unknowns_of
-from jourdain_jax.scene.names import Labels, UnknownNameError, check_name
+from jourdain_jax.scene.coordinates import Labels, UnknownNameError, check_name
 from jourdain_jax.scene.printing import Printed
 
 

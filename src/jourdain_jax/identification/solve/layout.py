@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Entries, Shape
-from jourdain_jax.identification.solve.body_inertia import BodyInertia
-from jourdain_jax.identification.solve.ties import Tie
-from jourdain_jax.scene.names import Labels
+from jourdain_jax.identification.solve.body_inertia import BodyInertia, Tie
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.scene import Scene
 
 # parameter; inertia of a body; initial value; number of a sensor or an actuator

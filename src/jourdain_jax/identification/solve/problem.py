@@ -21,8 +21,7 @@ from jourdain_jax.identification.inference.correlated_noise import (
     lowest,
 )
 from jourdain_jax.identification.solve.arrow import Arrow, ByMember, PerMember, arrow, triangle, with_prior
-from jourdain_jax.identification.solve.levenberg_marquardt import Control, Linearised, Minimum, minimise
-from jourdain_jax.identification.solve.loss import Loss
+from jourdain_jax.identification.solve.levenberg_marquardt import Control, Linearised, Loss, Minimum, minimise
 from jourdain_jax.identification.solve.run_groups import Group, Some, grouped
 from jourdain_jax.identification.solve.shooting import MultipleShooting
 from jourdain_jax.identification.solve.unknowns import Places, Unknowns

@@ -22,7 +22,7 @@ from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.inference.correlated_noise import Chains, whitened
 from jourdain_jax.identification.solve.layout import Layout
-from jourdain_jax.identification.solve.run_residuals import Run, on_equal_grids, run_of
+from jourdain_jax.identification.solve.shooting import Run, on_equal_grids, run_of
 from jourdain_jax.integrate.inputs import Sampled
 from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate

@@ -29,8 +29,7 @@ from jaxtyping import Float, Int
 from jourdain_jax.calculus.reals import largest
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.identification.data.experiment import Experiment
-from jourdain_jax.identification.data.responses import ideal
+from jourdain_jax.identification.data.experiment import Experiment, ideal
 from jourdain_jax.identification.solve.levenberg_marquardt import (
     Control,
     Linearised,

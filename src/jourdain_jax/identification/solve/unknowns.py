@@ -27,12 +27,15 @@ from jourdain_jax.identification.data.estimate import (
 )
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.data.sensors import UNITS, default_range
-from jourdain_jax.identification.solve.body_inertia import BodyInertia, PossibleInertia, inertia_of_body
+from jourdain_jax.identification.solve.body_inertia import (
+    BodyInertia,
+    PossibleInertia,
+    inertia_of_body,
+    tied_by,
+)
 from jourdain_jax.identification.solve.layout import Kind, Layout, Place
-from jourdain_jax.identification.solve.ties import tied_by
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.names import Labels, as_names, check_name
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import Labels, as_names, check_name, parameters_of
 from jourdain_jax.scene.scene import Scene
 
 Places = Float[np.ndarray, "*members places"]  # one number for each place

@@ -15,15 +15,14 @@ from jaxtyping import Array, PyTree
 
 from jourdain_jax.calculus.reals import at_index, eps_of
 from jourdain_jax.integrate import integrands
-from jourdain_jax.integrate.arrays.array_adjoint import cotangents
 from jourdain_jax.integrate.arrays.array_functions import ArrayForm, split
-from jourdain_jax.integrate.arrays.array_loop import Loop
+from jourdain_jax.integrate.arrays.array_loop import Loop, cotangents
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
+from jourdain_jax.integrate.loop.adjoint import moved
 from jourdain_jax.integrate.loop.handover import Found, Start
 from jourdain_jax.integrate.loop.loop_function import differentiated
 from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start
-from jourdain_jax.integrate.loop.time_shift import moved
 from jourdain_jax.integrate.setup import Begun, Setup
 from jourdain_jax.integrate.vector_fields.field import Integrated
 
@@ -82,7 +81,7 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
 
 def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
     """Return the reverse mode of `flow` as a function of the start and of the cotangents of the motion
-    (`array_adjoint.py`).
+    (`array_loop.py`).
     """
     back = partial(cotangents, of, asked, memory)
     if not at_once:

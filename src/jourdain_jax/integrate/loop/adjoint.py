@@ -12,11 +12,20 @@ k_j: slopes of the stages; g_1, g_0: cotangents of the state after and before th
 known numbers p. If the motion ended at a stop event, the backward pass begins with the event
 (`event_adjoint.py`).
 
-The same code computes reverse mode in JAX (`integrate/arrays/array_adjoint.py`). The derivative of the
+The same code computes reverse mode in JAX (`integrate/arrays/array_loop.py`). The derivative of the
 cotangents along a tangent consists of cotangents of the motion with that tangent: let S be the sum of all
 states times their cotangents g, and let g' be the change of g along the tangent. Reverse mode returns dS/dx,
 where x is the initial state and the known numbers. Its change is d(dS)/dx, where dS is the sum of states
 times g' and of their tangents times g. So the cotangents are g' for the states and g for their tangents.
+
+Shift a state along its rates by a time, to give it derivatives with respect to times.
+
+Machine code integrates between constant times. The start is shifted along its rates from the differentiable
+time t_0 to a constant time, t_0 - d, and the results are shifted back to differentiable times. Let z be the
+state and all arguments of its rates, and G the rate of z. A shift of z by a time d, whose value is zero, has
+the derivative
+
+    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to second order
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +37,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import filled
+from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.reals import Indices, Scalar
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.event_search import RUNNING
@@ -53,8 +62,9 @@ from jourdain_jax.integrate.loop.record import GOALS, TO_STATES, Slot, prepare, 
 from jourdain_jax.integrate.loop.samples import pass_knot
 from jourdain_jax.integrate.loop.step import near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.integrate.loop.transitions import write_reset_back
-from jourdain_jax.integrate.loop.value_kernels import called
+from jourdain_jax.integrate.loop.value_kernels import called, values_of_nodes
 from jourdain_jax.kernels.ffi import of_lane, write_handler
+from jourdain_jax.program.derivative import on_its_own
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
@@ -310,3 +320,64 @@ def flow_back(
 
 def _pulled(kernel: Callable, start: Start, g, ends, tries) -> Float[Array, "found"]:
     return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals, tries)
+
+
+Unknowns = Float[Array, "z"]
+
+
+def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
+    """Return a function of z and a time d that shifts z along its `rates` by d. The value of d is zero: it
+    only carries derivatives.
+    """
+
+    def moving_with_time(slope: Callable) -> Callable:
+        @jax.custom_jvp
+        def same(z, d, v):
+            return v
+
+        @partial(same.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (z, _, v), (_, dd, dv) = at, tangents
+            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(z, v), dd)
+
+        return same
+
+    along = moving_with_time(lambda z, v: jax.jvp(rates, (z,), (v,))[1])
+    back = moving_with_time(lambda z, g: jax.vjp(rates, z)[1](g)[0])
+
+    def push(arguments, tangents):
+        (z, d), (dz, dd) = arguments, tangents
+        dz = jnp.zeros_like(z) if dz is None else dz
+        return z, along(z, d, dz if dd is None else dz + scaled(rates(z), dd))
+
+    def pull(perturbed, arguments, found, g):
+        (z, d), (_, varies) = arguments, perturbed
+        g = back(z, d, g)
+        return g, jnp.sum(scaled(rates(z), g)) if varies else None
+
+    return with_rules(lambda z, d: z, Rules(push, pull))
+
+
+def rates_of_all(form: Form) -> Callable[[Unknowns], Unknowns]:
+    """Return the rates of z, which consists of the state, time, the known numbers, and the slopes of sampled
+    inputs. The rates of known numbers are zero.
+    """
+    graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
+    fixed, t, y, inputs = form.split(variables)
+    work = [graph.input("work", True)] if form.with_work else []
+    slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
+    z = [*y, *work, t, *fixed, *inputs, *slopes]
+    of_inputs = dict(zip(form.sampled, slopes, strict=True))
+    known = [graph.zero] * len(fixed) + [of_inputs.get(i, graph.zero) for i in range(len(inputs))]
+    return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
+
+
+@jax.custom_jvp
+def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
+    """Return the product `slope * by`; zero if `by` is zero, even if the slope is not finite."""
+    return jnp.where(by == 0.0, 0.0, slope * by)
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents):
+    return scaled(*primals), scaled(tangents[0], primals[1]) + scaled(primals[0], tangents[1])

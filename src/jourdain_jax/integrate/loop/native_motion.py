@@ -2,7 +2,7 @@
 kernel, and read its results.
 
 Inputs that are functions of time become part of the scalar program, which then depends on time and the
-numbers in these functions instead of the inputs. `time_shift.py` has the derivatives with respect to times.
+numbers in these functions instead of the inputs. `adjoint.py` has the derivatives with respect to times.
 
     u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
 """
@@ -21,16 +21,14 @@ from jaxtyping import Array, Float, PyTree
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import Indices, Scalar, Shape, real_type
 from jourdain_jax.integrate.explicit_steps import Method, code_at_end
-from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, Sampled
+from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop import taylor
-from jourdain_jax.integrate.loop.adjoint import flow_back
+from jourdain_jax.integrate.loop.adjoint import flow_back, moved, rates_of_all
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.handover import Found, Start
 from jourdain_jax.integrate.loop.rate_functions import check_derivatives, event_program
 from jourdain_jax.integrate.loop.time_functions import driven
-from jourdain_jax.integrate.loop.time_shift import moved, rates_of_all
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Passed, Setup, Solved
-from jourdain_jax.integrate.time_programs import FunctionOfTime
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported

@@ -271,7 +271,7 @@ def _write_metric(w: MachineWriter, of: Rows) -> None:
 
 def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
     """Return the scale of a speed from its diagonal entry of the mass matrix, as in
-    `equations/scaling.py: speed_scale`.
+    `equations/reductions.py: speed_scale`.
     """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)

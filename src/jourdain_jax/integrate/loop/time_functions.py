@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.integrate.inputs import Inputs
-from jourdain_jax.integrate.time_programs import FunctionOfTime, TimeProgram
+from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, TimeProgram
 from jourdain_jax.lowering.lowered_equations import NODES, Lowered
 from jourdain_jax.lowering.relations import jumps, sided, switches
 from jourdain_jax.program.analyticity import depend_on

@@ -19,16 +19,15 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Indices, PerLane, Scalar, Speeds, check_kind, described, static
 from jourdain_jax.dynamics.accelerations import Baumgarte
-from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.phases import contacts_at_start
+from jourdain_jax.equations.phases import At, contacts_at_start
 from jourdain_jax.equations.reductions import Reduction
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.lowering.lowered_equations import Lowered
+from jourdain_jax.scene.coordinates import Labels, check_name
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import Labels, check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.load_power import stored_by_inputs
 from jourdain_jax.structure.structure import Structure

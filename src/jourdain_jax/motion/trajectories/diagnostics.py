@@ -7,8 +7,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.compilation import with_nan_as_a_mark
 from jourdain_jax.calculus.reals import Count, Scalar, eps_of, largest, passing_cutoff, static
-from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.dynamics.reactions import ContactForce
+from jourdain_jax.dynamics.reactions import ContactForce, needs_work
 from jourdain_jax.integrate.inputs import Constant, Mode, Sampled
 from jourdain_jax.integrate.result_codes import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.integrate.vector_fields.field import reason_for_matrices

@@ -13,8 +13,7 @@ from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.integrate.result_codes import CODES
 from jourdain_jax.motion.trajectories.values_in_time import Record
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import Labels, check_names
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import Labels, check_names, parameters_of
 from jourdain_jax.scene.scene import state_names
 
 # name: field of a motion, type, missing value, attributes

@@ -41,8 +41,7 @@ from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases, Record, one_phase
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.parameter_fields import parameters_of
+from jourdain_jax.scene.coordinates import check_names, parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.trace import velocity_quantities
 

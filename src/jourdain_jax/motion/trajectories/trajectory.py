@@ -16,16 +16,22 @@ from jourdain_jax.equations.scene_parts import names_of_bodies
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.inputs import inputs_at
 from jourdain_jax.integrate.state_projection import State, known_faults_at
-from jourdain_jax.lowering.kinks import bent_load
+from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labels, values_in_time
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, lost_of, summary, warnings_of
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.motion.trajectories.values_in_time import Record, map_over_times, map_with_accelerations
 from jourdain_jax.scene.arguments import of_known_numbers
+from jourdain_jax.scene.coordinates import (
+    Labels,
+    Sentences,
+    UnknownNameError,
+    check_name,
+    nearest,
+    parameter_faults,
+)
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import Labels, Sentences, UnknownNameError, check_name, nearest
-from jourdain_jax.scene.parameter_fields import parameter_faults
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import state_names
 

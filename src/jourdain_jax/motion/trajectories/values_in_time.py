@@ -18,11 +18,10 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import NullSpaceSVD
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.integrate.inputs import Inputs
-from jourdain_jax.integrate.time_programs import for_programs
+from jourdain_jax.integrate.inputs import Inputs, for_programs
 from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.names import Labels
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import invariants_of

@@ -26,8 +26,8 @@ from jourdain_jax.calculus.reals import (
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.contact.grounds import Ground, Plane
+from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.motion_state import BodyPose
-from jourdain_jax.scene.names import Labels
 
 _HEIGHTS = ("coordinates", "row")
 IMPACTS = ("moreau", "newton", "poisson", "energetic")

@@ -21,12 +21,11 @@ import numpy as np
 
 from jourdain_jax.calculus.code import functions_in, names_in
 from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.scene.contact.held_rows import held_rows
-from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.coordinates import Coordinates, Labels, Names
 from jourdain_jax.scene.identity import once_per_class
+from jourdain_jax.scene.loads import held_rows
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
-from jourdain_jax.scene.names import Labels
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
 # values of a mode that tell why a motion cannot continue
