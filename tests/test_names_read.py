@@ -3,6 +3,7 @@ a constant where it is a class or a module.
 """
 
 import copy
+import functools
 import gc
 import importlib
 import pickle
@@ -198,6 +199,15 @@ HAS_STATE = {
 def test_what_has_state_is_refused_by_name_when_the_class_is_made(kind):
     with pytest.raises(ValueError, match=r"`Spring.loads` reads `k`, .*make it a field"):
         cell(HAS_STATE[kind], "1.0 if k is None else 1.0")
+
+
+def test_a_cached_method_is_refused_by_name_when_the_class_is_made():
+    with pytest.raises(ValueError, match=r"`Cached.bodies` is cached by functools.*remove the decorator"):
+
+        class Cached(jj.models.VerticalDisc):
+            @functools.lru_cache
+            def bodies(self, t, q):
+                return super().bodies(t, q)
 
 
 def test_methods_of_the_class_and_of_those_it_is_derived_from_count():

@@ -81,6 +81,11 @@ class NamesRead:
         readers: dict[Callable, dict[str, str]] = {}  # reader of names -> name -> the method that loads it
         for root in self._roots:
             for name, member in (dict(vars(root)) if isinstance(root, type) else {"": root}).items():
+                if name and hasattr(member, "cache_info"):
+                    raise StatefulError(
+                        f"`{root.__name__}.{name}` is cached by functools, which cannot cache what JAX traces;"
+                        " remove the decorator"
+                    )
                 content.append((name, _key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     functions.append(f)
