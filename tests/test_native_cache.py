@@ -195,8 +195,12 @@ def test_the_oldest_go_where_there_is_no_room(folder, monkeypatch):
     monkeypatch.setattr(host, "MOST_BYTES", 100)
     for name in "abc":
         host.kept(name, "llvm 20", lambda: b"x" * 40)
+        os.utime(folder / f"{name}.o", (ord(name), ord(name)))
+    host._make_room.cache_clear()  # as in another process
+    host.kept("d", "llvm 20", lambda: b"x" * 40)
     assert not (folder / "a.o").exists()
     assert (folder / "c.o").exists()
+    assert (folder / "d.o").exists()
 
 
 @machine_code.needed

@@ -245,8 +245,11 @@ def _read(file: Path) -> bytes:
         return b""
 
 
+@functools.cache
 def _make_room(place: Path) -> None:
-    """Remove the oldest files if all files together exceed `MOST_BYTES`."""
+    """Remove the oldest files if all files together exceed `MOST_BYTES`; once in a process, because looking
+    through 5,000 files takes 50 ms.
+    """
     found = sorted((file.stat().st_mtime, file.stat().st_size, file) for file in place.glob("*.o"))
     excess = sum(size for _, size, _ in found) - MOST_BYTES
     for _, size, file in found:
