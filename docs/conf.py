@@ -26,9 +26,11 @@ version = release = installed("jourdain-jax")
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
+    "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_parts.docstrings",
     "sphinx_parts.mathml",
+    "sphinx_parts.search",
 ]
 exclude_patterns = ["_build", "gallery/scenes", "README.md", "**.ipynb_checkpoints"]
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
@@ -51,12 +53,18 @@ nb_execution_excludepatterns = [
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # signatures show the types; shapes stand in the text
-autodoc_preserve_defaults = True
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+maximum_signature_line_length = 90
 
+templates_path = ["_templates"]
 html_theme = "furo"
-html_title = "jourdain-jax"
+html_title = f"jourdain-jax {version}"
 html_static_path = ["_static"]
+html_extra_path = ["gallery/pages/extra"]  # 3D views, which pages of the gallery embed
+html_favicon = "_static/logo.svg"
+html_theme_options = {"light_logo": "logo.svg", "dark_logo": "logo_dark.svg"}
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False

@@ -35,6 +35,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "docs" / "gallery" / "scenes"
 PAGES = ROOT / "docs" / "gallery" / "pages"
 WIDTH = 112  # columns of code on a page
+VIEWS = "extra/views"  # folder of the 3D views; Sphinx copies `extra` to the top of the site
+VEHICLES, ROBOTS, TEXTBOOK, LINKAGES = GROUPS = ("Vehicles", "Robots", "Toys and textbook", "Linkages")
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class Picture:
     start: str = "**scene.example"
     span: str = "scene.example_span"
     inputs: str = ""
+    group: str = TEXTBOOK  # on the index
 
 
 SCENE_PICTURES = {
@@ -60,17 +63,20 @@ SCENE_PICTURES = {
         start="left_rate=4.0, right_rate=6.0",
         span="6.0",
         paths='[("hull", (0, 0, 0)), ("trailer", (0, 0, 0))]',
+        group=ROBOTS,
     ),
     "car_with_trailers": Picture(
         title="Car with Ackermann steering and trailers",
         view='"above"',
         paths='[("car", (-1.3, 0, 0)), ("trailer 2", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "tricycle": Picture(
         title="Tricycle",
         at="2",
         span="2.2",
         paths='[("front", (0, 0, 0)), ("left", (0, 0, 0)), ("right", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "kick_scooter": Picture(
         title="Kick scooter",
@@ -79,12 +85,14 @@ SCENE_PICTURES = {
         span="0.8",
         paths='[("rear frame", (0, 0, 0))]',
         inputs='{"push": lambda t: 150.0 * jnp.exp(-(((t - 0.3) / 0.1) ** 2))}',
+        group=VEHICLES,
     ),
     "unicycle": Picture(
         title="Unicycle with a rider",
         at="4",
         span="1.6",
         paths='[("rider", (0, 0, 0)), ("wheel", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "ball_on_plate": Picture(
         title="Ball on a plate",
@@ -94,6 +102,7 @@ SCENE_PICTURES = {
         inputs=(
             '{"wanted_x": lambda t: 0.12 * jnp.cos(1.5 * t), "wanted_y": lambda t: 0.12 * jnp.sin(1.5 * t)}'
         ),
+        group=ROBOTS,
     ),
     "spherical_robot": Picture(
         title="Spherical robot driven by a pendulum",
@@ -101,6 +110,7 @@ SCENE_PICTURES = {
         span="1.2",
         paths='[("shell", (0, 0, 0))]',
         inputs='{"drive": 0.2}',
+        group=ROBOTS,
     ),
     "roller_racer": Picture(
         title="Roller racer",
@@ -109,12 +119,14 @@ SCENE_PICTURES = {
         span="6.0",
         paths='[("seat", (0, 0, 0))]',
         inputs='{"wanted": lambda t: 0.7 * jnp.sin(5.0 * t)}',
+        group=VEHICLES,
     ),
     "two_wheeled_pendulum": Picture(
         title="Two-wheeled inverted pendulum",
         span="4.0",
         start="pitch=0.0",
         inputs='{"speed": 1.0, "turn": lambda t: 0.5 * jnp.sin(2.0 * t)}',
+        group=ROBOTS,
     ),
     "satellite": Picture(
         title="Satellite with reaction wheels",
@@ -126,6 +138,7 @@ SCENE_PICTURES = {
         inputs=(
             '{"torque_x": lambda t: 1.0 * (t - 1.0), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}'
         ),
+        group=ROBOTS,
     ),
 }
 AXLE = Picture(
@@ -170,12 +183,12 @@ MODEL_PICTURES = {
         span="2.4",
     ),
     "rosenberg-particle": Picture(
-        "No force acts, and yet the row bends the path: y grows evenly, and x slows down as y moves away from"
-        " zero.",
+        "No force acts, and yet the constraint bends the path: y grows evenly, and x slows down as y moves"
+        " away from zero.",
         at="4",
     ),
     "heisenberg-particle": Picture(
-        "Rows on the velocities need not bend a path: this one is a straight line, where a vakonomic reading"
+        "Velocity constraints need not bend a path: this one is a straight line, where a vakonomic reading"
         " gives a helix.",
         at="4",
         span="4.0",
@@ -192,12 +205,13 @@ MODEL_PICTURES = {
         paths='[("body", (1.0, 0.0, 0.0))]',
     ),
     "snakeboard": Picture(
-        "The wheels steer past the place where both rows are parallel; the motion passes through.",
+        "The wheels steer past the place where both constraints coincide; the motion passes through.",
         view='"above"',
         at="(0.0, 0.8, 1.6)",
         span="1.6",
         start="steer=0.1, x_rate=1.0, rotor_rate=0.4, steer_rate=0.3",
         paths='[("board", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "rattleback": Picture(
         "Spun the wrong way, it rattles; in the end it turns back.",
@@ -211,15 +225,21 @@ MODEL_PICTURES = {
         at="2",
         span="0.6",
         paths='[("rear wheel", (0, 0, 0)), ("front wheel", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "double-pendulum-rods": Picture(
-        "Two rods of fixed length as geometric rows; compare the pendulum in angles.",
+        "Two rods of fixed length as geometric constraints; compare the pendulum in angles.",
         view='"side"',
         span="1.2",
         paths=BOTH,
+        group=LINKAGES,
     ),
     "double-pendulum-angles": Picture(
-        "The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH
+        "The same pendulum in angles: no constraint is left.",
+        view='"side"',
+        span="1.2",
+        paths=BOTH,
+        group=LINKAGES,
     ),
     "free-rigid-body": Picture(
         "The end of an axis runs along a curve that need not close: Euler's equations.",
@@ -232,9 +252,10 @@ MODEL_PICTURES = {
         view='"side"',
         span="1.5",
         paths=BOTH,
+        group=LINKAGES,
     ),
     "isokinetic-particle": Picture(
-        "A row that is quadratic in the speeds keeps the speed: the path bends down along a closed form.",
+        "A constraint quadratic in the speeds keeps the speed: the path bends down along a closed form.",
         view='"side"',
         at="5",
         span="0.6",
@@ -243,12 +264,14 @@ MODEL_PICTURES = {
         "The trailers follow the car on smaller and smaller circles.",
         view='"above"',
         paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]',
+        group=VEHICLES,
     ),
     "pendulum-chain": Picture(
         "Rods alone hold the particles; without damping the energy stays.",
         view='"side"',
         span="1.0",
         paths='[("particle 5", (0, 0, 0))]',
+        group=LINKAGES,
     ),
 }
 
@@ -256,14 +279,14 @@ TITLES = {  # of models, where the name in the registry is no title
     "two-wheel-axle-free": "Two wheels on an axle, as free bodies",
     "two-wheel-axle-coordinates": "Two wheels on an axle, in seven coordinates",
     "two-wheel-axle-quasi": "Two wheels on an axle, in quasi-velocities",
-    "two-wheel-axle-redundant": "Two wheels on an axle, with redundant rows",
+    "two-wheel-axle-redundant": "Two wheels on an axle, with redundant constraints",
     "tilting-disc-quaternion": "Tilting disc as a free body",
     "rosenberg-particle": "Rosenberg's particle",
     "heisenberg-particle": "Heisenberg's system",
     "ball-on-turntable": "Ball on a turntable",
     "suslov": "Suslov's problem",
     "whipple-bicycle": "Whipple's bicycle",
-    "double-pendulum-rods": "Double pendulum with rods as rows",
+    "double-pendulum-rods": "Double pendulum with rods as constraints",
     "double-pendulum-angles": "Double pendulum in angles",
     "trailer-chain": "Chain of trailers",
     "pendulum-chain": "Chain of pendulums",
@@ -329,10 +352,10 @@ def code_of(entry: Entry) -> str:
         call = f"motion = jj.simulate(\n    scene,\n    {start},\n    t1={p.span},\n   {inputs[1:]},\n)"
     lines = [
         "import jax.numpy as jnp\n\n" if "jnp." in inputs else "",
-        "import jourdain_jax as jj\nfrom jourdain_jax.views.pictures import draw_still\n",
+        "import jourdain_jax as jj\n",
         entry.import_line,
         f"\nscene = {entry.made}\n{call}\n",
-        f'draw_still(\n    motion,\n    "{entry.name}.png",\n    view={p.view},\n    at={p.at}{more},\n)',
+        f'jj.animate(\n    motion,\n    "{entry.name}.png",\n    view={p.view},\n    at={p.at}{more},\n)',
     ]
     return "".join(lines)
 
@@ -373,8 +396,12 @@ def page_of(entry: Entry, out: Path) -> str:
 
 ![{entry.title}: the motion, earlier times paler]({entry.name}.png)
 
-**What to look at.** {entry.look} To turn it and play it, open {{download}}`the 3D view
-<{entry.name}.html>` in a browser; `jj.show(motion)` makes one.
+**What to look at.** {entry.look}
+
+```{{raw}} html
+<iframe src="../../views/{entry.name}.html" title="{entry.title} in 3D" loading="lazy"
+  style="width: 100%; height: 26em; border: 0"></iframe>
+```
 
 ## The lines that draw it
 
@@ -397,26 +424,25 @@ def caption_of(entry: Entry) -> str:
 
 
 def index_of(chosen: list[Entry]) -> str:
-    """Thumbnails of the chosen pages, and their table of contents."""
-    cards = "\n".join(
-        f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type:"
-        f" doc\n\n{caption_of(entry)}\n:::\n"
-        for entry in chosen
-    )
+    """Thumbnails of the chosen pages by group, and their table of contents."""
+    sections = ""
+    for group in GROUPS:
+        cards = "\n".join(
+            f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n"
+            f":link-type: doc\n\n{caption_of(entry)}\n:::\n"
+            for entry in chosen
+            if entry.picture.group == group
+        )
+        if cards:
+            sections += f"\n## {group}\n\n::::{{grid}} 1 2 3 3\n:gutter: 2\n\n{cards}\n::::\n"
     pages = "\n".join(entry.name for entry in chosen)
     return f"""# Gallery
 
-Each page has a picture, the lines that draw it, what to look at, and the source. Earlier times are drawn
-paler; lengths are in metres.
+Each page has a picture, a 3D view, the lines that draw the picture, and the source of the scene.
+Earlier times are drawn paler; lengths are in metres.
 A ball in a bowl, a robot with driven wheels and a disc on a hill stand, with their code, among the
 [rolling contacts](../../contacts.md).
-
-::::{{grid}} 1 2 3 3
-:gutter: 2
-
-{cards}
-::::
-
+{sections}
 ```{{toctree}}
 :hidden:
 :maxdepth: 1
@@ -431,7 +457,7 @@ def write(entry: Entry, out: Path) -> Path:
     with contextlib.chdir(out):
         drawn: dict = {}
         exec(compile(code_of(entry), f"{entry.name}.md", "exec"), drawn)
-        jj.show(drawn["motion"], f"{entry.name}.html", title=entry.title, forces=False)
+        jj.show(drawn["motion"], f"{VIEWS}/{entry.name}.html", title=entry.title, forces=False)
     page = out / f"{entry.name}.md"
     page.write_text(page_of(entry, out))
     return page
@@ -473,7 +499,7 @@ def main(arguments: list[str] | None = None) -> None:
         if name not in known:
             parser.error(f"no page `{name}`, expected some of: {', '.join(known)}")
     out = asked.out.resolve()
-    out.mkdir(parents=True, exist_ok=True)
+    (out / VIEWS).mkdir(parents=True, exist_ok=True)
     processes = min(asked.processes, len(names))
     if processes > 1:
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:

@@ -800,6 +800,9 @@ FILES: dict[str, Case] = {
         "lane: jj.animate(rollout.lane(0), 'lane-0.gif')"
     ),
     "jj.animate(run, 'run.mp4')": "cannot write `run.mp4`: an animation is a .gif file",
+    "jj.animate(run, 'run.png', view='top')": (
+        "`view` is `top`, expected one of `above`, `side`, `space`, or elevation and azimuth in degrees"
+    ),
     "jj.animate(run, 'run.gif', frames=0)": "`frames` is 0, expected a whole number of at least 1",
     "jj.plot(run, 'x', path='run.xyz')": (
         "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file; matplotlib cannot write `xyz`"

@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,8 +43,12 @@ def test_every_public_name_stands_once_in_the_reference():
 def test_the_search_of_the_built_site_finds_every_public_name():
     written = re.fullmatch(r"Search\.setIndex\((.*)\)\s*", SEARCHED.read_text(encoding="utf-8"), re.DOTALL)
     index = json.loads(written[1])
-    found = {entry[-1]: index["docnames"][entry[0]] for entry in index["objects"]["jourdain_jax"]}
-    assert sorted({name.rpartition(".")[2] for name in PUBLIC} - set(found)) == []
+    found = {
+        f"{module}.{entry[-1]}": index["docnames"][entry[0]]
+        for module, entries in index["objects"].items()
+        for entry in entries
+    }
+    assert sorted(name for name in PUBLIC if f"jourdain_jax.{name}" not in found) == []
     assert {page.partition("/")[0] for page in found.values()} == {"reference"}
 
 
@@ -184,6 +190,22 @@ def test_a_design_is_made_stable_as_its_page_says(capsys):
 def test_the_code_of_the_page_on_what_is_learned_runs():
     page = run(DOCS / "howto" / "learned.md")
     assert page["errors"][-1] < 0.3 * page["errors"][0]
+
+
+@pytest.mark.parametrize(
+    ("way", "files"), [(0, ["sleigh.png"]), (1, ["log.csv", "fit.html"]), (2, ["sweep.zarr", "cluster.zarr"])]
+)
+def test_the_ways_to_work_of_the_first_page_run_from_an_empty_folder(way, files, tmp_path):
+    code = [
+        block for block in code_of(DOCS / "index.md") if "print(motion)" not in block and "show(" not in block
+    ]
+    assert len(code) == 3
+    assert len(code[way].splitlines()) <= 40
+    subprocess.run([sys.executable, "-W", "error::UserWarning", "-c", code[way]], cwd=tmp_path, check=True)
+    assert all((tmp_path / file).exists() for file in files)
+    if way == 2:
+        found = [jj.load_study(tmp_path / file).to_xarray()["lean"].values for file in files]
+        assert found[0].tobytes() == found[1].tobytes()
 
 
 def test_the_readme_has_at_most_five_hundred_words():

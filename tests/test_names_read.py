@@ -205,9 +205,7 @@ def test_a_cached_method_is_refused_by_name_when_the_class_is_made():
     with pytest.raises(ValueError, match=r"`Cached.bodies` is cached by functools.*remove the decorator"):
 
         class Cached(jj.models.VerticalDisc):
-            @functools.lru_cache
-            def bodies(self, t, q):
-                return super().bodies(t, q)
+            bodies = functools.lru_cache(jj.models.VerticalDisc.bodies)
 
 
 def test_methods_of_the_class_and_of_those_it_is_derived_from_count():

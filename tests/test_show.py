@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.views.looks import guessed
-from jourdain_jax.views.pictures import draw_still
 
 RED = "#ff0000"
 
@@ -262,7 +261,7 @@ def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     ("view", "hidden"), [("above", "z"), ("side", "y"), ("space", ""), ((20.0, -50.0), "")]
 )
 def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path, drawn, view, hidden):
-    draw_still(motion, tmp_path / "ball.png", view=view, at=2)
+    jj.animate(motion, tmp_path / "ball.png", view=view, at=2)
     (axes,) = drawn[0].axes
     corners = np.concatenate([path.vertices for path in axes.collections[-1].get_paths()])
     shown = axes.transAxes.inverted().transform(axes.transData.transform(corners))

@@ -53,7 +53,9 @@ def add(verbs) -> None:
     running.add_argument(
         "--plot", metavar="FILE", help="write a plot of all coordinates to this file (.png, .svg, .pdf)"
     )
-    running.add_argument("--animate", metavar="FILE", help="write an animation to this file (.gif)")
+    running.add_argument(
+        "--animate", metavar="FILE", help="write an animation (.gif) or one picture (.png) to this file"
+    )
     running.set_defaults(run=_simulate)
 
 

@@ -83,8 +83,8 @@ class NamesRead:
             for name, member in (dict(vars(root)) if isinstance(root, type) else {"": root}).items():
                 if name and hasattr(member, "cache_info"):
                     raise StatefulError(
-                        f"`{root.__name__}.{name}` is cached by functools, which cannot cache what JAX traces;"
-                        " remove the decorator"
+                        f"`{root.__name__}.{name}` is cached by functools, which cannot keep traced values; "
+                        "remove the decorator"
                     )
                 content.append((name, _key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):

@@ -1,4 +1,4 @@
-"""Pictures of a scene's bodies by matplotlib: animations, stills, and the view of a scene in a notebook."""
+"""Pictures of a scene's bodies with matplotlib: animations, stills, and the view of a scene in a notebook."""
 
 from collections.abc import Sequence
 
@@ -16,13 +16,17 @@ from jourdain_jax.views.space import axes_in_space, box_of, draw, legend, painte
 
 # elevation and azimuth, degrees
 VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}
+_STILL = (".png", ".svg", ".pdf")
 
 
 def check_suffix(path: FilePath) -> None:
-    """Raise ValueError if an animation cannot be written to this path."""
+    """Raise ValueError if neither an animation nor a picture can be written to this path."""
     check_place(path)
-    if not str(path).lower().endswith(".gif"):
-        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+    if not str(path).lower().endswith((".gif", *_STILL)):
+        raise ValueError(
+            f"cannot write `{path}`: an animation is a .gif file, one picture a {', '.join(_STILL[:-1])} or "
+            f"{_STILL[-1]} file"
+        )
 
 
 @of_known_numbers
@@ -31,39 +35,59 @@ def animate(
     path: FilePath,
     *,
     frames: int = 60,
+    at: int | Sequence[float] = 3,
     paths: Sequence[tuple[str, Sequence[float]]] | None = None,
     follow: bool = False,
-    view: tuple[float, float] = (22.0, -60.0),
+    view: str | tuple[float, float] = "space",
     title: str | None = None,
 ) -> None:
-    """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
+    """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies, or one picture
+    (.png, .svg, .pdf) with the bodies at a few times, earlier ones paler.
 
     - `frames`: maximum number of frames, taken at evenly spaced saved times. The animation lasts as long as
       the motion, but at least 2 and at most 12 s.
+    - `at`: times of the bodies in one picture, s (the nearest saved times are drawn), or a number of times,
+      evenly spaced from the start to the end.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
-    - `follow`: whether the view moves with the bodies instead of showing the whole path. `view`: elevation
-      and azimuth in degrees.
-    - `title`: a line above the drawing (default: none).
+    - `follow`: whether the view of an animation moves with the bodies instead of showing the whole path.
+    - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
+    - `title`: a line of text (default: none).
 
-    Raises ValueError for a suffix other than .gif or a motion that reached none of its times, and ImportError
-    without matplotlib.
+    Raises ValueError for another suffix, an unknown view or body, or a motion that reached none of its times,
+    and ImportError without matplotlib.
     """
     _check_one(trajectory, "`animate`", "jj.animate(rollout.lane(0), 'lane-0.gif')")
     frames = checked_whole(frames, "`frames`", 1, expected="of at least 1")
     check_suffix(path)
-    plt = pyplot()
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
-    drawn = looks_of(trajectory, "animate", frames)
+    if isinstance(view, str) and view not in VIEWS:
+        raise ValueError(
+            f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
+            "or elevation and azimuth in degrees"
+        )
+    angles, plt, still = (
+        VIEWS[view] if isinstance(view, str) else view,
+        pyplot(),
+        str(path).lower().endswith(_STILL),
+    )
+    drawn = looks_of(trajectory) if still else looks_of(trajectory, "animate", frames)
     if paths is None:
         paths = [(name, np.zeros(3)) for name in drawn.bodies if name]
-    traces = _traces(trajectory, drawn, paths)
+    traces = [np.asarray(trajectory.point(*end))[drawn.reached] for end in paths]
+    if still:
+        _draw_still(plt, drawn, traces, path, angles, title, at)
+    else:
+        _animate(plt, drawn, traces, path, angles, title, follow)
+
+
+def _animate(plt, drawn: Drawn, traces: list, path: FilePath, angles: tuple, title, follow: bool) -> None:
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
     bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
     boxes = np.stack([box_of(faces[:1]) for faces in bodies])
     whole = box_of([*boxes, *traces])
     half = np.ptp(boxes, axis=1).max() * 0.62  # half the side of the square that follows the bodies
     figure = plt.figure(figsize=(6.0, 5.0))
-    axes = axes_in_space(figure, view, (0.03, 0.02, 0.9, 0.88))
+    axes = axes_in_space(figure, angles, (0.03, 0.02, 0.9, 0.88))
     clock = figure.text(0.03, 0.91, "", family="monospace")
     figure.text(0.25, 0.91, title or "")
     legend(figure, drawn)
@@ -83,45 +107,19 @@ def animate(
     plt.close(figure)
 
 
-def draw_still(
-    trajectory: Trajectory,
-    path: FilePath,
-    *,
-    at: int | Sequence = 3,
-    paths: Sequence[tuple[str, Sequence]] | None = None,
-    view: str | tuple = "space",
-) -> None:
-    """Draw a motion as one picture: its bodies at a few times, earlier ones paler, and the paths of points.
-
-    - `at`: times in s (the nearest saved times are drawn), or a number of times, evenly spaced from the start
-      to the end.
-    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
-    - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
-
-    Raises ValueError for a rollout, an unknown view or body, or a motion that reached none of its times, and
-    ImportError without matplotlib.
-    """
-    _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
-    if isinstance(view, str) and view not in VIEWS:
-        raise ValueError(
-            f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
-            "or elevation and azimuth in degrees"
-        )
-    plt, drawn = pyplot(), looks_of(trajectory)
+def _draw_still(plt, drawn: Drawn, traces: list, path: FilePath, angles: tuple, title, at) -> None:
     if not isinstance(at, int):
         wanted = np.asarray(at, float)
     else:
         wanted = np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
     chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
-    if paths is None:
-        paths = [(next(name for name in drawn.bodies if name), np.zeros(3))]
-    traces = _traces(trajectory, drawn, paths)
     strengths = np.linspace(1.0, 0.35, len(chosen))[::-1]
     faces, colours = zip(*map(painted, [drawn] * len(chosen), chosen, strengths), strict=True)
     figure = plt.figure(figsize=(6.4, 4.2), dpi=100)
-    axes = axes_in_space(figure, VIEWS[view] if isinstance(view, str) else view, (0.05, 0.07, 0.88, 0.83))
+    axes = axes_in_space(figure, angles, (0.05, 0.07, 0.88, 0.83))
     draw(axes, (np.concatenate(faces), np.concatenate(colours)), traces, box_of([*faces, *traces]))
     legend(figure, drawn, len(traces))
+    figure.text(0.05, 0.02, title or "")
     figure.savefig(path)
     plt.close(figure)
 
@@ -130,8 +128,8 @@ def scene_picture(scene) -> str:
     """Return HTML with a picture of a scene's bodies and their shadows at its `example`; empty if there are
     none.
 
-    A scene that cannot start has no picture: notebooks also display unfinished scenes, whose faults
-    `jj.start` reports.
+    A scene that cannot start has no picture, because notebooks also display unfinished scenes. `jj.start`
+    reports their faults.
     """
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
@@ -148,8 +146,3 @@ def _check_one(trajectory, where: str, example: str) -> None:
             f"{where} was given {described(trajectory)}, expected one motion; for a "
             f"rollout pass one lane: {example}"
         )
-
-
-def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:
-    """Return the paths (times, 3) of body points, m."""
-    return [np.asarray(trajectory.point(*end))[drawn.reached] for end in ends]
