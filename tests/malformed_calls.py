@@ -176,16 +176,16 @@ OPTIONS |= {
         "'native' cannot integrate `ChaplyginSleigh`: the solver is"
     ),
     "calls['simulate'](backend='native', formulation=jj.Formulation(reduction='kkt'))": (
-        "'native' cannot integrate `ChaplyginSleigh`: its own reduction"
+        "'native' cannot integrate `ChaplyginSleigh`: a formulation with its own reduction"
     ),
     "calls['rollout'](backend='native', formulation=jj.Formulation(reduction='kkt'))": (
-        "'native' cannot integrate `ChaplyginSleigh`: its own reduction"
+        "'native' cannot integrate `ChaplyginSleigh`: a formulation with its own reduction"
     ),
     "calls['simulate'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": (
-        "'xla' cannot integrate `ChaplyginSleigh`: its own reduction"
+        "'xla' cannot integrate `ChaplyginSleigh`: a formulation with its own reduction"
     ),
     "calls['rollout'](backend='xla', formulation=jj.Formulation(reduction='kkt'))": (
-        "'xla' cannot integrate `ChaplyginSleigh`: its own reduction"
+        "'xla' cannot integrate `ChaplyginSleigh`: a formulation with its own reduction"
     ),
     "calls['simulate'](backend='nativ')": "unknown backend `nativ` ... native",
     "calls['rollout'](backend='nativ')": "unknown backend `nativ` ... native",

@@ -499,7 +499,7 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         jj.family(bicycle, turns.folds[0])
     with pytest.raises(ValueError, match="expected two axes"):
         jj.stability_chart(bicycle, {"c": (0.02, 0.12)})
-    with pytest.raises(ValueError, match=r"`prior` is .*each with `jj.studies.Normal"):
+    with pytest.raises(ValueError, match=r"`prior` is .*expected a dictionary of `jj.studies.Normal"):
         jj.stability_chart(
             bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (9.0, 10.0)}, prior={"w": 0.1}, points=3
         )

@@ -39,7 +39,7 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     )
 
     # rows of A and B: rates of the independent ds, in axes that rotate with the unperturbed motion, and of
-    # the privileged speeds. A rotation ds after q has the rate d(q0' q)/dt = q0' (qdot - q0dot q0' q), with
+    # the independent speeds. A rotation ds after q has the rate d(q0' q)/dt = q0' (qdot - q0dot q0' q), with
     # q0dot q0' dq = (B q0dot) ds
     rates = (S + 4 * turned @ q).T[kept] @ (along[at.qdot] @ T - turned @ v[at.qdot] @ T[:count])
     rates = xp.concatenate([rates, along[constant] @ T])
@@ -55,11 +55,11 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
 
 def _second_order(scene: Scene, A, B, mass, independent: Labels, y, coordinates: Labels):
     """Return M, C, K, F of the named coordinates, and their coupling to other coordinates. `mass`: mass
-    matrix of the privileged speeds.
+    matrix of the independent speeds.
     """
     count, k, xp = len(independent), len(coordinates), array_module(A)
     p = np.array([independent.index(name) for name in coordinates], int)
-    # (ds, pdot, other privileged speeds) = change x
+    # (ds, pdot, other independent speeds) = change x
     kept = count + _speeds_beside(scene, y, coordinates)
     change = xp.concatenate([xp.eye(count, A.shape[0]), A[p], xp.eye(A.shape[0])[kept]])
     back = inverse(change)
@@ -95,7 +95,7 @@ def own_rate(scene: Scene, name: str) -> int | None:
 
 
 def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:
-    """Return the positions in y of the privileged speeds other than the rates of the named coordinates."""
+    """Return the positions in y of the independent speeds other than the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # one per degree of freedom: their rates replace all of y
     own = [own_rate(scene, name) for name in coordinates]

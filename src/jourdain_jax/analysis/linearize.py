@@ -1,12 +1,12 @@
 """Linearise the equations of motion about a steady motion, on the constraint manifold.
 
-    x = (independent coordinates, privileged speeds):              dx/dt = A x + B f
+    x = (independent coordinates, independent speeds):             dx/dt = A x + B f
     named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f
                                                                    M = W' (mass matrix) W
 
 Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second-order form
 is Appell's equations for the named coordinates: the first-order form, written with the speeds (pdot, other
-privileged speeds) and multiplied by M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson,
+independent speeds) and multiplied by M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson,
 G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
@@ -64,7 +64,7 @@ class Modes(eqx.Module):
 class Linearization(Printed, eqx.Module):
     """Linear equations of small motions about a state.
 
-    x = (independent coordinates, privileged speeds): dx/dt = A x + B f. For the named coordinates p:
+    x = (independent coordinates, independent speeds): dx/dt = A x + B f. For the named coordinates p:
     M pddot + C pdot + K p = F f.
     """
 
@@ -74,7 +74,7 @@ class Linearization(Printed, eqx.Module):
     C: Float[Array, "parts parts"]
     K: Float[Array, "parts parts"]
     F: Float[Array, "parts inputs"]
-    acceleration: Scalar  # largest |dy/dt| of the privileged speeds y at the state; zero if it is steady
+    acceleration: Scalar  # largest |dy/dt| of the independent speeds y at the state; zero if it is steady
     residual: Scalar  # larger of `acceleration` and |d2y/dt2| along the motion; zero if it is steady
     # largest coefficient of other coordinates in the second-order form, relative to those in M, C, K
     coupling: Scalar
@@ -154,20 +154,21 @@ class Linearization(Printed, eqx.Module):
     def state_eigenvalues(self) -> Complex[Array, "states"]:
         """Return eigenvalues of A, 1/s, by ascending real part.
 
-        Ignorable coordinates, and speeds of which a steady motion may have any value, give zero eigenvalues.
+        Ignorable coordinates, and speeds that may have any value in a steady motion, give zero eigenvalues.
         These often form Jordan blocks and are then sensitive to round-off: an error of 1e-16 may change a
         zero eigenvalue to 1e-8. `eigenvalues` omits them.
         """
         return _roots(self.A)
 
     def state_space(self, outputs: Outputs = None) -> StateSpace:
-        """Return dx/dt = A x + B f, y = C x + D f with the named outputs y.
+        """Return the model dx/dt = A x + B f, y = C x + D f with the named outputs y.
 
             small.state_space("lean yaw_rate")
             small.state_space({"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))[1]})
 
-        `outputs`: names of coordinates and speeds, also dependent ones, or name -> function of a `Motion`
-        (one instant) that returns one number; default: the states. Raises ValueError for an unknown name.
+        `outputs`: names of coordinates and speeds, including dependent ones, or a dictionary of functions by
+        name, each from a `Motion` (one instant) to one number; default: the states. Raises ValueError for an
+        unknown name.
         """
         scene, state, f = self.about
         count, (S, turned) = len(self.states), perturbations(scene)
@@ -191,13 +192,13 @@ class Linearization(Printed, eqx.Module):
         return self.state_space(outputs).to_control()
 
     def minimal(self, outputs: Outputs = None) -> StateSpace:
-        """Return `state_space(outputs)` without ignorable states and uncontrollable modes, for instance for a
-        regulator; `states` has the names of those kept, and `outputs` (default) as well.
+        """Return `state_space(outputs)` without ignorable states and uncontrollable modes, for example for a
+        regulator. `states` of the result, and by default also `outputs`, are the names of the states kept.
 
-        Omitted are states on which no speed and no given output depends, directly or through others: x, y and
-        yaw of a bicycle. Omitted are also states that follow from others when the inputs alone move the
-        scene: its forward speed, or one of two equal pendulums on one cart. The motion that only initial
-        values excite is lost, also if it grows: compare `state_eigenvalues`.
+        States on which no speed and no given output depends, directly or through others, are omitted, such as
+        x, y and yaw of a bicycle. States that other states determine, if only the inputs move the scene, are
+        also omitted, such as the forward speed of a bicycle, or one of two equal pendulums on a cart. Modes
+        that only initial values can excite are lost, even if they grow: compare `state_eigenvalues`.
         """
         first = sum(name not in self.about[0].speed_names.entries for name in self.states)
         return minimal(self.state_space(outputs), first, outputs is not None)
@@ -235,8 +236,9 @@ def linearize(
     - `state`: a state on the constraints. If only ignorable coordinates move, such as the yaw and the spin of
       a disc, the motion is steady and the matrices are constant along it. Otherwise they hold only at this
       instant, and `residual` measures the deviation.
-    - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is privileged.
-      A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body axes.
+    - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is
+      independent. A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body
+      axes.
     - `inputs`: values of the scene's inputs (default: zero), held constant.
     - `dependent`: names of the coordinates that the geometric constraints determine; `privileged`: names of
       the independent speeds. Defaults are well conditioned at the state (for a traced state or traced
@@ -245,11 +247,11 @@ def linearize(
     No option of `jj.Options` applies, because nothing is integrated. `jj.build` chooses the backend.
 
     **Returns** a `Linearization`. The function is pure and runs under jit, vmap and differentiation with
-    respect to parameters and state. If the privileged speeds do not determine the others, all results are NaN
-    and `code` is not 0: name others.
+    respect to parameters and state. If the independent speeds do not determine the others, all results are
+    NaN and `code` is not 0: name others.
 
     **Raises** ValueError for an unknown coordinate or speed; for a named coordinate that is dependent or
-    whose rate is not privileged; and, at a known state, if the independent speeds or coordinates do not
+    whose rate is not independent; and, at a known state, if the independent speeds or coordinates do not
     determine the others. **Warns** (`SensitivityWarning`) if a load has a kink or jumps at the state, as dry
     friction does at rest.
     """
@@ -274,7 +276,7 @@ def linearize(
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` are not determined by its "
-            f"constraints at this state (pivot {float(found.pivot):.1e}): choose others by `privileged` or "
+            f"constraints at this state (pivot {float(found.pivot):.1e}): choose others with `privileged` or "
             "`dependent`, or linearize at a nearby state"
         )
     return found

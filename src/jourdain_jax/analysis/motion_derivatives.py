@@ -110,8 +110,8 @@ class Sloped:
 
 
 class ByProgram:
-    """Scalar program for v, D and the mass matrix (unless it is too large) of a class of scenes. Its argument
-    is a vector of all numbers: parameters, t, q, u, inputs.
+    """Scalar program for the rates and constraints v of a class of scenes, their Jacobian D, and the mass
+    matrix unless it is too large. Its argument is a vector of all numbers: parameters, t, q, u, inputs.
     """
 
     def __init__(self, scene: Scene, program: Lowered, asked: Indices, varied: Indices = ()) -> None:
@@ -196,8 +196,9 @@ def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":
-    """Return the function that evaluates v and D of a scene at an instant. `constant`: indices of the speeds
-    whose accelerations are needed; `masses`: whether the mass matrix is needed.
+    """Return the function that evaluates the rates and constraints v of a scene and their Jacobian D at an
+    instant. `constant`: indices of the speeds whose accelerations are needed; `masses`: whether the mass
+    matrix is needed.
     """
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)

@@ -47,7 +47,7 @@ class Report(Printed):
     Integrability of constraints, each and together: eqs. (5)-(9) and Frobenius' theorem. Privileged (that is,
     independent) velocities: (25)-(31). Cyclic coordinates: (42).
 
-    A coordinate is cyclic if its rate is not privileged and no equation depends on it. A coordinate is
+    A coordinate is cyclic if its rate is a dependent speed and no equation depends on it. A coordinate is
     ignorable if no acceleration depends on it; without constraints, every coordinate that is absent from the
     Lagrangian is ignorable.
     """
@@ -71,7 +71,7 @@ class Report(Printed):
     depends_on_time: Labels  # which of: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # whether constraints are linear or affine in the speeds
     cyclic_coordinates: Labels  # their rates are dependent, and no equation contains them
-    ignorable_coordinates: Labels  # no privileged acceleration depends on them
+    ignorable_coordinates: Labels  # accelerations of the independent speeds do not depend on them
     privileged_velocities: Labels
     privileged_by_user: bool
     lowering: str  # number of operations of the scalar program and how it is integrated, or why there is none

@@ -2,8 +2,9 @@
 
     dx/dt = A x + B f,    y = C x + D f
 
-`minimal` omits states without effect, and states that follow from others when the inputs alone move the
-scene. Then x = X x' with names kept, and A' = (A X)', B' = B', C' = C X: the prime takes the kept rows.
+`minimal` omits states that have no effect, and states that other states determine if only the inputs move the
+scene. With x = X x', where x' are the states kept, the matrices become (A X)', B' and C X; the prime selects
+the rows of the states kept.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,12 +26,12 @@ Outputs = str | Labels | list[str] | Mapping[str, Callable[[Any], Any]] | None
 
 
 class StateSpace(Printed, eqx.Module):
-    """A linear model dx/dt = A x + B f, y = C x + D f of deviations from a motion.
+    """Linear model dx/dt = A x + B f, y = C x + D f of deviations from a motion.
 
         model = jj.linearize(scene, state).minimal()
         gains, _, poles = control.lqr(model.to_control(), Q, R)
 
-    `print` shows the matrices with the names of `states`, `inputs` and `outputs`.
+    `print` shows the matrices with the names of states, inputs and outputs.
     """
 
     A: Float[Array, "states states"]
@@ -67,8 +68,9 @@ def outputs_of(
     slope: Callable[[Callable, Array], Array],
     states: Labels,
 ) -> tuple[Labels, Float[Array, "outputs independent"]]:
-    """Return names of outputs and the matrix [C D]. `followed`: its rows for the `known` names and inputs;
-    `slope`: derivative of a function of a `Motion` along one of its columns.
+    """Return the names of outputs and the matrix [C D]. `followed`: rows of such a matrix for the names
+    `known`, then for the inputs; `slope`: returns the derivative of a function of a `Motion` along a column
+    of `followed`.
     """
     if isinstance(outputs, Mapping):
         return tuple(outputs), jnp.stack([_row(*output, followed, slope) for output in outputs.items()])
@@ -89,10 +91,11 @@ def _row(name: str, of: Callable, followed: Float[Array, "all independent"], slo
 
 def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
     """Return the model without states on which neither speeds nor (if `named`) outputs depend, directly or
-    through others, and without states that follow from others when the inputs alone move the scene.
+    through others, and without states that other states determine if only the inputs move the scene.
 
-    Entries below `rank_cutoff` times the largest count as zero, in a unit of time that makes rates of speeds
-    and of coordinates comparable. `first_speed`: place of the first speed among the states.
+    Entries below `rank_cutoff` times the largest entry count as zero. The unit of time is chosen so that
+    rates of speeds and of coordinates are comparable. `first_speed`: index of the first speed among the
+    states.
     """
     A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
     of_coordinates = np.arange(len(A)) < first_speed
@@ -130,10 +133,12 @@ def largest_of(x: np.ndarray) -> float:
 def _controllable(
     A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n inputs"], cutoff: float
 ) -> Float[np.ndarray, "n controllable"]:
-    """Return an orthonormal basis of the span of B, A B, A^2 B, ..., by directions that are new in turn."""
+    """Return an orthonormal basis of the span of B, A B, A^2 B, ..., extended by the new directions of each
+    product.
+    """
     basis, new, size = np.zeros((len(A), 0)), B, largest_of(B)
     while new.size:
-        for _ in range(2):  # twice is enough
+        for _ in range(2):  # twice, for orthogonality to round-off
             new = new - basis @ (basis.T @ new)
         directions, sizes, _ = np.linalg.svd(new, full_matrices=False)
         found = directions[:, sizes > cutoff * size]

@@ -1,8 +1,8 @@
-"""Find steady motions: privileged speeds are constant, and only ignorable coordinates change.
+"""Find steady motions: independent speeds are constant, and only ignorable coordinates change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0
 
-y: the privileged speeds; j: the coordinates that are not ignorable. Families of steady motions use the same
+y: the independent speeds; j: the coordinates that are not ignorable. Families of steady motions use the same
 equations (`motion_derivatives.py`). The Levenberg-Marquardt method solves them from the guess
 (`calculus/roots.py`). The residual of the result contains dy/dt and d2y/dt2 along the motion, and so does not
 rely on the list of ignorable coordinates.
@@ -145,9 +145,7 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
     """Return t, q, u of a guess."""
     if isinstance(guess, State):
         return guess.t, guess.q, guess.u
-    check_kind(
-        guess, Mapping, "`guess`", "a State or a dictionary of named values; those not named start from zero"
-    )
+    check_kind(guess, Mapping, "`guess`", "a State or a dictionary of named values; omitted values are zero")
     q, u, _ = scene.named(**guess)
     return as_time(t0), q, u
 

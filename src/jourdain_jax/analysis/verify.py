@@ -188,7 +188,7 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
 
 
 def _size(found: dict, *others) -> float:
-    """Return the reference size for differences of forces: that of impressed and inertial forces."""
+    """Return the reference size for differences of forces: the size of impressed and inertial forces."""
     forces = (found["impressed"], found["gyroscopic"], *others)
     return sum(largest(force) for force in forces) + tiny_of(found["M"])
 
@@ -216,9 +216,7 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
             suspect: largest(forces.sum(0) - found["reference"]) / of_newton
             for suspect, forces in newton.items()
         },
-        "energy": {
-            "a load whose potential does not give its force, or a constraint with uncounted power": energy
-        },
+        "energy": {"a load whose potential does not give its force, or a constraint that does work": energy},
     }
 
 

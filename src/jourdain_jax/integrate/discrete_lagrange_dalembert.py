@@ -249,7 +249,7 @@ def _fault(scene: Scene, structure: Structure) -> str:
     if structure.varying_inertia:
         return "its masses or inertias change along the motion, so there is no Lagrangian"
     if structure.dependent_rows:
-        return "its constraints are redundant, but none can be omitted everywhere"
+        return "its constraints are redundant, but no constraint can be omitted everywhere"
     return ""
 
 

@@ -53,8 +53,8 @@ MESSAGES = {
         "contacts (an impact that gains energy, Painleve's paradox)"
     ),
     SINGULAR_PARTITION: (
-        "near the last time the privileged speeds do not determine the others, or "
-        "the scene's `coordinate_rates` become infinite; choose other `privileged` or other "
+        "near the last time the independent speeds do not determine the others, or the scene's "
+        "`coordinate_rates` become infinite; choose other `privileged` speeds, define other "
         "speeds, pass retry=True, or, unless constraints lose rank, "
         "`formulation=jj.Formulation('full')` with `backend='dense'`"
     ),

@@ -105,7 +105,7 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
             f"constraints {named} are redundant at all probed states, but not provably everywhere"
         )
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
-        raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
+        raise NotLowered("its constraints are redundant, but no constraint can be omitted everywhere")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
         if traced.effects:

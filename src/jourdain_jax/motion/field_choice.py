@@ -87,7 +87,7 @@ def _program(
     """
     reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
-        reason = "its own reduction or stabilisation requires dense matrices"
+        reason = "a formulation with its own reduction or stabilisation requires dense matrices"
     if backend == "dense" or (backend == "auto" and reason):
         return None
     program = reason or lowered(scene, every_speed=not minimal)

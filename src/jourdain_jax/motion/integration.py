@@ -288,7 +288,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
 
 
 def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
-    """Return the result code: that of the first condition that holds, otherwise the integrator's. `of_drift`:
+    """Return the code of the first condition that holds, or else the code of the integrator. `of_drift`:
     further conditions for motions that reached their end, with their codes.
     """
     start, end, code = begun.start, solved.y_end, solved.code

@@ -193,7 +193,7 @@ class Model(BuiltFor, Printed):
             )
         if self.structure.chosen_by_user and self.state == "full":
             said.append(
-                "the scene's privileged speeds do not determine the others everywhere in its domain, "
+                "the scene's `privileged` speeds do not determine the others everywhere in its domain, "
                 "so all speeds are integrated"
             )
         if self.structure.decisions != _decisions_where_traced(self.reference.scene):
@@ -278,7 +278,7 @@ class Model(BuiltFor, Printed):
 
 
 def _decisions_where_traced(scene: Scene) -> tuple:
-    """Return the decisions about a scene with all parameters traced by JAX."""
+    """Return the decisions that `build` would make if JAX traced all parameters of the scene."""
     found: list[tuple] = []
     jax.eval_shape(lambda scene: found.append(structure_whatever_its_faults(scene).decisions), scene)
     return found[0]

@@ -226,8 +226,8 @@ _NUMBERS = {  # condition, expectation and advice
     "atol": _POSITIVE,
     "max_step": (
         lambda x: x > 0,
-        "a positive time in s; None limits steps by the span, inf sets no limit",
-        "pass the longest step in s, None for a part of the span, or inf for no limit",
+        "a positive time in s; None limits steps to 1/16 of the span, inf sets no limit",
+        "pass the longest step in s, None for 1/16 of the span, or inf for no limit",
     ),
 }
 

@@ -135,7 +135,7 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
             solver=solver,
         )
     if retries & result_codes.IMPLICIT:
-        # an implicit step costs as much as tens of explicit ones, so allow a tenth as many
+        # an implicit step costs as much as tens of explicit steps, so allow a tenth of the number
         options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
     return options
 

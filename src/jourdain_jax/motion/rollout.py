@@ -157,12 +157,12 @@ class Rollout(Printed, eqx.Module):
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
             lines.append(
-                f"  {len(self.continued)} left the domain of their privileged speeds and "
-                "were run with the full state"
+                f"  {len(self.continued)} were run again with the full state, because their "
+                "independent speeds became invalid"
             )
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & result_codes.IMPLICIT))
         if stiff:
-            lines.append(f"  {stiff} are stiff and were run with an implicit solver")
+            lines.append(f"  {stiff} were run again with an implicit solver, because they are stiff")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)

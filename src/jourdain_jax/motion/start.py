@@ -206,7 +206,7 @@ def _held(model: Model, given: Labels, about: Labels) -> tuple[tuple, bool]:
     """Return masks of free coordinates, free speeds, and coordinates that must stay in the domain; typical
     sizes; and whether given values may contradict each other.
 
-    Omitted privileged speeds stay zero unless a dependent speed is given. Coordinates that are neither given
+    Omitted independent speeds stay zero unless a dependent speed is given. Coordinates that are neither given
     nor guessed must lie in the domain, unless the constraints are affine and determine them uniquely.
     """
     scene, known = model.scene, structure_of(model.scene)
@@ -249,7 +249,7 @@ def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> 
         name, found = scene.coordinate_names.entries[k], float(state.q[k])
         raise ValueError(
             f"no start of `{who}` has `{name}` in its `domain`, {scene.domain[name]}, with the given values "
-            f"held ({held}); the nearest has {found:.6g}. Change the values or the `domain`, or pass "
+            f"held ({held}); the nearest start has {found:.6g}. Change the values or the `domain`, or pass "
             f'near={{"{name}": {found:.2g}}} to search outside'
         )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
@@ -260,7 +260,7 @@ def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> 
         bounded and name in scene.domain
         for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True)
     )
-    elsewhere = ", pass some as guesses by `near=` to search outside the `domain`" if within else ""
+    elsewhere = ", pass some as guesses with `near=` to search outside the `domain`" if within else ""
     raise ValueError(
         f"the start of `{who}` violates constraint `{names[worst]}`: residual "
         f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}). Give fewer "

@@ -92,8 +92,8 @@ def stability_chart(
         sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
     except (AttributeError, TypeError):
         raise ValueError(
-            f"`prior` is {given}, expected names of parameters of one number, each with "
-            "`jj.studies.Normal(mean, sigma)`"
+            f"`prior` is {given}, expected a dictionary of `jj.studies.Normal(mean, sigma)` by the "
+            "names of scalar parameters"
         ) from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []

@@ -38,7 +38,7 @@ Unknowns = Float[Array, "all_unknowns"]
 FOUND, NOT_FOUND, SINGULAR = range(3)
 MEANINGS = (
     "found",
-    "not found: the family's point does not continue to these parameters",
+    "not found: the point of the family cannot be followed to these parameters",
     "not a smooth function of the parameters here: eigenvalues or special points coincide",
 )
 SHAPES = {
@@ -94,7 +94,7 @@ class Special(eqx.Module):
     X: Unknowns
 
     def parts(self, X: Unknowns) -> list[Array]:
-        """Return z, a, b and w."""
+        """Split X into z, a, b and w."""
         n, m = len(self.equations.places), len(self.equations.states)
         return jnp.split(X, [n, n + m, n + 2 * m])
 
@@ -133,12 +133,12 @@ class Special(eqx.Module):
         return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
 
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
-        """Return G."""
+        """Return the residual G of the equations."""
         L, c = self.linear(near)
         return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
     def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
-        """Return (G_X, G)."""
+        """Return the Jacobian and the residual, (G_X, G), as one matrix."""
         (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
         G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
         size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])

@@ -126,12 +126,12 @@ class Motions(ABC):
         return {name: float(numbers[k]) for name, k in self.by_name.items()}
 
     def place(self, point) -> Vector:
-        """Return z for the values of the unknowns in `point`, by name."""
+        """Return the vector z of the unknowns for the values in `point`."""
         return np.array([point[name] for name in self.unknowns]) / self.size
 
     @abstractmethod
     def __call__(self, z: Vector) -> Look:
-        """Return the equations at z."""
+        """Return the equations and their derivatives at z."""
 
     @abstractmethod
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
@@ -151,7 +151,9 @@ class Motions(ABC):
 
 
 class SteadyEquations(Motions):
-    """R, J, F and C of one scene as functions of z. The `held` unknowns keep their values at the guess."""
+    """Equations of the steady motions of one scene: R, J, F and C as functions of z. The `held` unknowns keep
+    their values at the guess.
+    """
 
     what, modes = "steady motions", "eigenvalues, 1/s"
     growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
@@ -194,7 +196,7 @@ class SteadyEquations(Motions):
         )
 
     def __call__(self, z: Vector) -> Look:
-        """Return the equations at z."""
+        """Return the equations and their derivatives at z."""
         v, D, _ = self.instant.of(self.at(z))
         J, F, C = (D[block] for block in self.slopes)
         return self.with_held(v[self.rows], J, z, (F, C))

@@ -25,8 +25,8 @@ States = Float[Array, "states"]
 
 
 class Shooting(eqx.Module):
-    """R and its derivatives as functions of the unknowns: the states at the starts of the pieces, shape
-    (pieces, states), and the period.
+    """Equations of multiple shooting: the residual R and its derivatives as functions of the unknowns, which
+    are the states at the starts of the pieces, shape (pieces, states), and the period.
     """
 
     scene: Scene
@@ -74,7 +74,7 @@ class Shooting(eqx.Module):
         return event_values(self.scene, motion_at(self.scene, t, *self.split(z), inputs_at(self.inputs, t)))
 
     def constraints(self, t, z: States) -> tuple[Array, Array]:
-        """Return g and phi with their derivatives with respect to z."""
+        """Return the constraint residuals (g, phi) and their derivatives with respect to z."""
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, t, *self.split(z), inputs_at(self.inputs, t))
         rows = np.concatenate([at.g, at.phi])
@@ -92,7 +92,9 @@ class Shooting(eqx.Module):
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
     def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
-        """Return R for pieces that end at `ends`; each entry is divided by the size of its quantity."""
+        """Return the residual R for pieces that end at `ends`, each entry divided by the size of its
+        quantity.
+        """
         zs, _ = self.pieces_of(x)
         there = jnp.roll(zs, -1, axis=0)
         changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
@@ -102,12 +104,14 @@ class Shooting(eqx.Module):
         )
 
     def ends(self, t, x: Unknowns) -> Float[Array, "pieces states"]:
-        """Return all f_k."""
+        """Return the states f_k at the ends of all pieces."""
         zs, period = self.pieces_of(x)
         return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
 
     def slopes(self, t, x: Unknowns) -> tuple[Array, Array, Array]:
-        """Return df_k/dz_k, df_k/dT, and f_k."""
+        """Return the derivatives of all end states f_k with respect to the start states z_k and the period T,
+        and f_k.
+        """
         zs, period = self.pieces_of(x)
 
         def of_piece(k, z):
@@ -120,7 +124,7 @@ class Shooting(eqx.Module):
         return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
 
     def look(self, t, x: Unknowns) -> tuple[Array, Array, tuple[Array, Array]]:
-        """Return R, dR/dx, and df_k/dz_k with f_k."""
+        """Return the residual R, its Jacobian dR/dx, and df_k/dz_k with f_k."""
         D, of_period, ends = self.slopes(t, x)
 
         def linear(change):

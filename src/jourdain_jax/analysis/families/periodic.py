@@ -155,7 +155,7 @@ def periodic(
     built, scene = scene, as_scene(scene)
     inputs = as_inputs(scene, by_name.pop("inputs", None))
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
-    beside = "it integrates one `period`, passes stop events, and needs neither work nor retries"
+    beside = "one `period` is integrated, stop events are passed, and neither work nor retries are needed"
     options = as_options(
         options,
         {**tolerances, **by_name},
@@ -225,8 +225,8 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R, its derivatives and the multipliers of one scene as functions of z: the unknowns of a periodic
-    motion and one varying parameter.
+    """Equations of the periodic motions of one scene: the residual R, its derivatives and the multipliers as
+    functions of z, which are the unknowns of a periodic motion and one varying parameter.
     """
 
     what, modes = "periodic motions", "multipliers"
@@ -252,7 +252,7 @@ class OrbitEquations(Motions):
         self.held = np.array([self.index(name) for name in held], int)
 
     def __call__(self, z: Vector) -> Look:
-        """Return the equations at z."""
+        """Return the equations, their derivatives and the multipliers at z."""
         R, J, multipliers = map(np.asarray, _looked(self.problem, self.vary, self.t, self.at(z)))
         return self.with_held(R, J[:, self.places], z, (multipliers,))
 

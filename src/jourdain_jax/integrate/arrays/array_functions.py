@@ -1,8 +1,8 @@
 """Rates, projection and events as JAX functions, in place of the scalar program that machine code uses.
 
-The code of a step also computes its derivatives; JAX differentiates only these functions. The tangents of the
-state are stored after the state (`integrate/loop/form.py`), those of the arrays that all steps share after
-these arrays. `pushed` returns a function with all tangents, by nested `jvp`.
+The code of a step also computes its derivatives; JAX differentiates only these functions. Tangents are stored
+after the values: after the state (`integrate/loop/form.py`), and after the arrays that all steps share.
+`pushed` returns the values of a function with all tangents, by nested `jvp`.
 """
 
 import math

@@ -1,8 +1,8 @@
 """Memory layout of the loop: a lane is a column, each number is a row, and a row is one vector for all lanes.
 
 A sample enters with the rows of `Form.given`, which include its initial progress, and leaves with the rows of
-its final progress. Tangents of the state are stored after the state, those of the rates' known numbers after
-these numbers. `dt` are tangents of time, which only the time of an event has. Derivatives of order n in
+its final progress. Tangents are stored after the values: after the state, and after the known numbers of the
+rates. `dt` are tangents of time, which only the time of an event has. Derivatives of order n in
 directions e_1 to e_n have 2^n - 1 tangents, one per subset of the directions, indexed by the binary number of
 the subset. For second order, these are the tangents along e_1, along e_2, and along both. `taken` is the
 advance by the last step. For Taylor series, `before` is the start time of the step, and `bound` limits the
@@ -123,7 +123,9 @@ class Form:
         ]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
-        """Return the nodes of fixed values, of time, of the state without work, and of the inputs."""
+        """Split `variables` into the nodes of fixed values, of time, of the state without work, and of
+        inputs.
+        """
         t = len(self.program.fixed)
         end = t + 1 + self.q_and_v
         return variables[:t], variables[t], variables[t + 1 : end], variables[end:]

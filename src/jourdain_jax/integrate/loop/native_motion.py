@@ -113,7 +113,7 @@ def _reason_against_program(form: Form, order: int | None) -> str:
         try:
             event_program(form)
         except Unsupported as error:
-            return f"a stop event has no rate on the graph ({error})"
+            return f"the rate of a stop event has no scalar form ({error})"
     return "" if order is None else _reason_against_series(form, order)
 
 
@@ -123,7 +123,7 @@ def _reason_against_series(form: Form, order: int) -> str:
     if reason := taylor.reason_against(form.program.graph, form.rates):
         return reason
     count = taylor.products(form, order)
-    return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
+    return f"Taylor series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:

@@ -214,7 +214,7 @@ def nodes_called(
 
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
-    """Return a function like that of `nodes_called`, with derivatives. Nodes that are structurally zero cost
+    """Return the same function as `nodes_called`, with derivatives. Nodes that are structurally zero cost
     nothing.
     """
     graph, nodes, variables = on_its_own(graph, nodes, variables)

@@ -117,7 +117,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
 
 
 def lost_of(trajectory: Record) -> OverTimes | None:
-    """Return the energy lost in events up to each saved time (J); None if the motion continued after none."""
+    """Return the energy lost in events up to each saved time (J); None if no event continues the motion."""
     return trajectory.phases.lost_until(trajectory.ts) if trajectory.phases.ts.shape[-1] else None
 
 
@@ -151,13 +151,13 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     warned = []
     if low != high:
         warned.append(
-            f"constraints change their rank along the motion, {low} to {high}: constraint forces "
-            "and the further motion may not be unique"
+            f"the rank of the constraints changes along the motion, {low} to {high}: constraint "
+            "forces and the motion afterwards may not be unique"
         )
     elif high < usual:
         warned.append(
             f"constraints have rank {high} on the whole motion, but {usual} at generic states: a singular "
-            "configuration or another assembly; state a `domain` around the motion to decide"
+            "configuration or another assembly; declare a `domain` around the motion to find out"
         )
     elif smallest < np.sqrt(eps_of(trajectory.q)):
         warned.append(f"constraints nearly lose rank (singular value {smallest:.1e}): digits are lost there")
@@ -183,7 +183,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     # state or a scalar program end with a result code instead
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
-            f"the reduction's independent speeds hardly determine the others (pivot {pivot:.1e}), "
+            f"the independent speeds of the reduction hardly determine the others (pivot {pivot:.1e}), "
             f"so no digit of the accelerations is reliable in {trajectory.q.dtype}; use the "
             "default `reduction` or float64"
         )
