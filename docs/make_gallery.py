@@ -142,8 +142,8 @@ SCENE_PICTURES = {
     ),
 }
 AXLE = Picture(
-    "All methods of the paper agree: heading and axle turn evenly, and it drifts across the slope (x points"
-    " downhill) instead of running away.",
+    "All methods of the paper agree: the heading changes at a constant rate, and the axle drifts across the"
+    " slope (x points downhill) instead of running down.",
     view='"above"',
     at="4",
     span="5.0",
@@ -156,56 +156,54 @@ MODEL_PICTURES = {
     "two-wheel-axle-quasi": AXLE,
     "two-wheel-axle-redundant": AXLE,
     "skate": Picture(
-        "Set turning, it drifts across the slope (x points downhill) and comes back up, in cycloids.",
+        "A turning skate drifts across the slope (x points downhill) along a cycloid.",
         view='"above"',
         at="6",
         span="5.0",
     ),
     "chaplygin-sleigh": Picture(
-        "It starts backwards, turns over, and runs off straight with the blade behind.",
+        "It starts backwards, turns around, and ends up straight with the blade behind.",
         view='"above"',
         at="6",
     ),
     "vertical-disc": Picture(
-        "Both rates stay what they are: the path is a circle.",
+        "Both rates are constant, and the path is a circle.",
         at="3",
         start="heading_rate=0.5, roll_rate=2.0",
         span="5.0",
     ),
     "tilting-disc": Picture(
-        "It rolls along loops while its lean and its turning swing about a steady motion.",
+        "The disc rolls along loops while lean and turn rate oscillate about a steady motion.",
         at="(0.0, 0.9, 1.8)",
         span="2.4",
     ),
     "tilting-disc-quaternion": Picture(
-        "The same disc with its attitude as a quaternion, which also serves where it lies flat.",
+        "The same disc with a quaternion, which has no singularity where the disc lies flat.",
         at="(0.0, 0.9, 1.8)",
         span="2.4",
     ),
     "rosenberg-particle": Picture(
-        "No force acts, and yet the constraint bends the path: y grows evenly, and x slows down as y moves"
-        " away from zero.",
+        "The constraint alone bends the path: y grows at a constant rate, and x slows down away from y = 0.",
         at="4",
     ),
     "heisenberg-particle": Picture(
-        "Velocity constraints need not bend a path: this one is a straight line, where a vakonomic reading"
-        " gives a helix.",
+        "A velocity constraint need not bend a path: this one is straight. Vakonomic equations give a helix.",
         at="4",
         span="4.0",
     ),
     "ball-on-turntable": Picture(
-        "On a turning table the ball goes round in a circle, like a charge in a magnetic field, at 2/7 of the"
+        "On a turning table the ball moves in a circle, like a charge in a magnetic field, at 2/7 of the"
         " table's rate.",
         at="4",
     ),
     "suslov": Picture(
-        "It ends in a steady turn about its second axis, whatever the start.",
+        "From any start, the motion ends in a steady rotation about the second axis.",
         at="(3.0,)",
         span="8.0",
         paths='[("body", (1.0, 0.0, 0.0))]',
     ),
     "snakeboard": Picture(
-        "The wheels steer past the place where both constraints coincide; the motion passes through.",
+        "The motion continues through the steer angle at which both constraints are parallel.",
         view='"above"',
         at="(0.0, 0.8, 1.6)",
         span="1.6",
@@ -214,60 +212,60 @@ MODEL_PICTURES = {
         group=VEHICLES,
     ),
     "rattleback": Picture(
-        "Spun the wrong way, it rattles; in the end it turns back.",
+        "Spun in the wrong direction, the stone rattles and finally reverses its spin.",
         at="(0.05,)",
         span="0.5",
         view="(30, -60)",
         paths='[("stone", (0.2, 0, 0))]',
     ),
     "whipple-bicycle": Picture(
-        "At 4.5 m/s it catches itself: lean turns the handlebar into the fall.",
+        "At 4.5 m/s the bicycle is stable by itself: lean turns the handlebar into the fall.",
         at="2",
         span="0.6",
         paths='[("rear wheel", (0, 0, 0)), ("front wheel", (0, 0, 0))]',
         group=VEHICLES,
     ),
     "double-pendulum-rods": Picture(
-        "Two rods of fixed length as geometric constraints; compare the pendulum in angles.",
+        "The rods are geometric constraints; compare the pendulum in angles.",
         view='"side"',
         span="1.2",
         paths=BOTH,
         group=LINKAGES,
     ),
     "double-pendulum-angles": Picture(
-        "The same pendulum in angles: no constraint is left.",
+        "The same pendulum in angles, without constraints.",
         view='"side"',
         span="1.2",
         paths=BOTH,
         group=LINKAGES,
     ),
     "free-rigid-body": Picture(
-        "The end of an axis runs along a curve that need not close: Euler's equations.",
+        "The end of an axis moves along a curve that need not close.",
         at="(8.0,)",
         span="8.0",
         paths='[("body", (1.0, 0.0, 0.0))]',
     ),
     "spring-and-rod": Picture(
-        "A rod keeps two particles apart while a spring holds the first to the origin.",
+        "A rod keeps two particles apart; a spring pulls the first towards the origin.",
         view='"side"',
         span="1.5",
         paths=BOTH,
         group=LINKAGES,
     ),
     "isokinetic-particle": Picture(
-        "A constraint quadratic in the speeds keeps the speed: the path bends down along a closed form.",
+        "A constraint quadratic in the velocity keeps the speed constant while the path bends down.",
         view='"side"',
         at="5",
         span="0.6",
     ),
     "trailer-chain": Picture(
-        "The trailers follow the car on smaller and smaller circles.",
+        "Each trailer follows on a smaller circle than the body ahead of it.",
         view='"above"',
         paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]',
         group=VEHICLES,
     ),
     "pendulum-chain": Picture(
-        "Rods alone hold the particles; without damping the energy stays.",
+        "Only rods hold the particles; without damping the energy is conserved.",
         view='"side"',
         span="1.0",
         paths='[("particle 5", (0, 0, 0))]',

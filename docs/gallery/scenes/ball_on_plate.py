@@ -1,8 +1,7 @@
-"""A ball on a plate that tilts about two axes through the middle of its top: the classic of control
-laboratories.
+"""A ball on a plate that tilts about two axes through the middle of its top, a classic experiment in control.
 
-About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's
-absolute angle of rolling s: left alone, a ball runs off. Motors therefore tilt the plate against the place
+Near the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute
+angle of rolling s: without control, the ball runs off. Motors therefore tilt the plate against the position
 and the velocity of the ball. Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12
 (2002) 217 describes the apparatus.
 """
@@ -12,14 +11,14 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 LOOK = (
-    "The plate tilts so that the ball follows a point on a circle, with a lag. With all four gains zero it"
-    " runs off."
+    "The plate tilts so that the ball follows a point on a circle, with a lag. If all four gains are"
+    " zero, the ball runs off."
 )
 
 
 class BallOnPlate(jj.Scene):
-    """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: the
-    place where the ball is wanted (m).
+    """Coordinates: x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball.
+    Inputs: the desired position of the ball (m).
     """
 
     ball_mass: float = jj.parameter(0.3, unit="kg", positive=True)

@@ -1,9 +1,9 @@
-"""A car with Ackermann steering and n trailers, each hitched to the axle ahead: what planners call the
-n-trailer.
+"""A car with Ackermann steering and n trailers, each hitched to the axle ahead (the n-trailer of path
+planning).
 
 The linkage turns the inner front wheel more, cot(outer) - cot(inner) = track / wheelbase, so that all axles
-meet in one point. The rows of both front wheels then say the same, to round-off: n + 3 rows of rank n + 2.
-Source: J.-P. Laumond, Proc. IROS (1993) 1033.
+meet in one point. The constraints of both front wheels are then equal to round-off: n + 3 constraints of rank
+n + 2. Source: J.-P. Laumond, Proc. IROS (1993) 1033.
 """
 
 import equinox as eqx
@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 LOOK = (
-    "All axles of the car meet in one point: the rows of both front wheels agree to round-off. The trailers"
-    " cut the corners more and more."
+    "All axles of the car meet in one point: the constraints of both front wheels agree to round-off. Each"
+    " trailer cuts corners more than the one ahead."
 )
 
 
 class CarWithTrailers(jj.Scene):
-    """x, y of the rear axle, heading, steer (of a wheel in the middle), headings of the trailers. Inputs:
-    `drive` (N) and `steer_torque` (N m).
+    """Coordinates: x, y of the rear axle, heading, steer (of an imaginary wheel in the middle), headings of
+    the trailers. Inputs: `drive` (N) and `steer_torque` (N m).
     """
 
     trailers: int = eqx.field(static=True, default=2)

@@ -1,22 +1,22 @@
-"""A kick scooter with its rider standing still: a Whipple bicycle with small wheels and a low deck, pushed
-from behind.
+"""A kick scooter whose rider stands still: a Whipple bicycle with small wheels and a low deck, pushed from
+behind.
 
-Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s its rider must steer: left
-alone it falls. Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers
-are those of an adult's scooter, estimated.
+Straight and upright, a push F accelerates it by F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s it falls
+unless the rider steers. Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the
+parameters are estimates for an adult's scooter.
 """
 
 import jourdain_jax as jj
 
 LOOK = (
-    "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall,"
-    " too little and too late."
+    "After one kick nobody steers. At this speed the front wheel turns into the fall too late, and the lean"
+    " grows."
 )
 
 
 class KickScooter(jj.models.WhippleBicycle):
-    """The Whipple bicycle with a scooter's numbers. Inputs: those of the bicycle, and `push`: the foot's
-    force on the ground, forward on the deck (N).
+    """The Whipple bicycle with the parameters of a scooter. Inputs: those of the bicycle, and `push`, the
+    forward force on the deck from the foot on the ground (N).
     """
 
     w: float = jj.parameter(0.86, unit="m", positive=True, about="wheelbase")

@@ -1,8 +1,8 @@
 """A differential-drive robot that pulls a trailer on a hitch behind its axle: two driven wheels, one trailer
 axle, two degrees of freedom.
 
-Both wheels forbid the same sideways slip: five rows of rank four. On a steady circle the trailer's axle runs
-on a smaller one,
+Both wheels prevent the same sideways slip: five constraints of rank four. On a steady circle of radius R the
+trailer's axle runs on a smaller circle,
 R_t^2 = R^2 + hitch^2 - tongue^2. Source: C. Altafini, Int. J. Robotics Research 20 (2001) 515 (off-axle
 hitches).
 """
@@ -10,14 +10,14 @@ hitches).
 import jourdain_jax as jj
 
 LOOK = (
-    "Cut corners: the trailer's axle runs inside the robot's track, by $R_t^2 = R^2 + hitch^2 - tongue^2$"
-    " once the turn is steady."
+    "The trailer cuts corners: in a steady turn its axle runs on a circle with"
+    " $R_t^2 = R^2 + hitch^2 - tongue^2$, inside that of the robot."
 )
 
 
 class RobotWithTrailer(jj.Scene):
-    """x, y of the middle of the axle, heading; angles of the wheels; heading of the trailer. Inputs: torques
-    on the wheels (N m).
+    """Coordinates: x, y of the middle of the axle, heading; angles of the wheels; heading of the trailer.
+    Inputs: torques on the wheels (N m).
     """
 
     hull_mass: float = jj.parameter(6.0, unit="kg", positive=True)

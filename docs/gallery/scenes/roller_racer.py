@@ -1,4 +1,4 @@
-"""The roller racer: two bodies with an axle each, joined by a pivot; swinging the handlebar drives it
+"""The roller racer: two bodies with an axle each, joined by a pivot. Swinging the handlebar drives it
 forward.
 
 With the mass centres on the axles, straight running at the speed v straightens the handlebar like exp(-v t
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "No wheel is driven: arms that swing the handlebar to and fro set it going along a wavy line."
+LOOK = "No wheel is driven: swinging the handlebar from side to side drives the racer along a wavy line."
 
 
 class RollerRacer(jj.Scene):
-    """x, y of the seat's axle, heading; angle of the handlebar from the seat. Input: `wanted`, the angle at
-    which the arms hold the handlebar (rad).
+    """Coordinates: x, y of the seat's axle, heading; angle of the handlebar relative to the seat. Input:
+    `wanted`, the angle at which the arms hold the handlebar (rad).
     """
 
     seat_mass: float = jj.parameter(20.0, unit="kg", positive=True)

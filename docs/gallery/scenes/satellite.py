@@ -1,9 +1,9 @@
-"""A satellite with three reaction wheels: torques inside turn it, and its angular momentum in space stays
-what it was.
+"""A satellite with three reaction wheels: internal torques turn it, and its angular momentum in space is
+conserved.
 
-Driven about one principal axis from rest, the satellite turns by -I_w / (I + I_w) of the wheel's angle
-against it. Nothing holds it:
-no row at all. Source: P. C. Hughes, Spacecraft Attitude Dynamics (1986), ch. 6 (gyrostats).
+If one wheel is driven from rest about a principal axis, the satellite turns by -I_w / (I + I_w) times the
+angle of the wheel relative to it. There are no constraints. Source: P. C. Hughes, Spacecraft Attitude
+Dynamics (1986), ch. 6 (gyrostats).
 """
 
 import jax.numpy as jnp
@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 LOOK = (
-    "The wheels are driven from rest; the satellite turns against them, and its total angular momentum stays"
-    " zero."
+    "The wheels are driven from rest. The satellite turns in the opposite direction, and the total angular"
+    " momentum stays zero."
 )
 
 
 class Satellite(jj.Scene):
-    """x, y, z of the bus and its attitude; angles of the wheels on its faces. Inputs: torques of the wheels'
-    motors (N m).
+    """Coordinates: x, y, z of the bus and its attitude; angles of the wheels on its faces. Inputs: torques of
+    the wheels' motors (N m).
     """
 
     bus_mass: float = jj.parameter(30.0, unit="kg", positive=True)
@@ -55,7 +55,7 @@ class Satellite(jj.Scene):
         )
 
     def invariants(self, motion):
-        """Angular momentum about the mass centre, in space (N m s)."""
+        """Return the angular momentum about the mass centre, in space (N m s)."""
         bodies = [motion[name] for name in ("bus", "wheel x", "wheel y", "wheel z")]
         mass = sum(body.mass for body in bodies)
         middle, drift = (

@@ -1,8 +1,8 @@
-"""A spherical robot: a shell that a pendulum inside drives about an axle fixed in the shell.
+"""A spherical robot: a shell, driven by a pendulum inside that turns about an axle fixed in the shell.
 
 At rest and without torque, the pendulum swings fore and aft at W, W^2 = m g l / (m l^2 + J - (m r l)^2 / ((M
 + m) r^2 + I)): the shell rolls back under it. Source: V. A. Joshi, R. N. Banavar and R. Hippalgaonkar, Mech.
-Mach. Theory 45 (2010) 130 (the kind of robot).
+Mach. Theory 45 (2010) 130 (such robots).
 """
 
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 LOOK = (
-    "The axle starts tilted, the drive pushes, and the robot runs along a bow whose side changes as the axle"
+    "The axle starts tilted. The driven robot follows a curve that bends to alternate sides as the axle"
     " rocks."
 )
 
 
 class SphericalRobot(jj.Scene):
-    """x, y of the contact, attitude of the shell, angle of the pendulum in the shell. Input: `drive`, a
-    torque on the shell about the axle (N m).
+    """Coordinates: x, y of the contact, attitude of the shell, angle of the pendulum in the shell. Input:
+    `drive`, a torque on the shell about the axle (N m).
     """
 
     shell_mass: float = jj.parameter(1.0, unit="kg", positive=True)

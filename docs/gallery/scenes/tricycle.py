@@ -1,22 +1,18 @@
 """A tricycle (a fork-lift, a tug): the front wheel is driven and steered, two rear wheels roll freely.
 
-Three wheels carry a determined share each. In a turn with the steer angle d the rear wheels turn at (R -+
-track/2)/r with
-R = wheelbase / tan(d), the front wheel at sqrt(R^2 + wheelbase^2)/r. Source: R. Siegwart and I. Nourbakhsh,
-Autonomous Mobile Robots (2004), 3.2.
+The shares of the load on three wheels are determined. In a turn with the steer angle d the rear wheels turn
+at (R -+ track/2)/r, R = wheelbase / tan(d), and the front wheel at sqrt(R^2 + wheelbase^2)/r, for one unit of
+turn rate. Source: R. Siegwart and I. Nourbakhsh, Autonomous Mobile Robots (2004), 3.2.
 """
 
 import jourdain_jax as jj
 
-LOOK = (
-    "The rear wheels turn at different rates, which is what a differential is for; the outer one carries more"
-    " than the inner one."
-)
+LOOK = "The rear wheels turn at different rates, as a differential allows; the outer one carries more load."
 
 
 class Tricycle(jj.Scene):
-    """x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs: `drive` about the
-    front axle and `steer_torque` (N m).
+    """Coordinates: x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs:
+    `drive` about the front axle and `steer_torque` (N m).
     """
 
     frame_mass: float = jj.parameter(60.0, unit="kg", positive=True)

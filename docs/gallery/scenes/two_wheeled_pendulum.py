@@ -1,21 +1,22 @@
-"""A two-wheeled inverted pendulum (a Segway): two coaxial wheels, driven against a body that would fall over.
+"""A two-wheeled inverted pendulum (a Segway): motors between a body and two coaxial wheels keep the body
+upright.
 
 Upright at rest and without a controller the pitch grows like exp(s t), s^2 = m g h / (m h^2 + J - (m h r)^2 /
-((m + 2 m_w) r^2 + 2 I)). Both wheels forbid the same sideways slip: four rows of rank three. Source: F.
-Grasser et al., IEEE Trans. Ind. Electron. 49 (2002) 107.
+((m + 2 m_w) r^2 + 2 I)). Both wheels prevent the same sideways slip: four constraints of rank three. Source:
+F. Grasser et al., IEEE Trans. Ind. Electron. 49 (2002) 107.
 """
 
 import jourdain_jax as jj
 
 LOOK = (
-    "It first rolls back in order to lean forward, then speeds up: the two torques feed back pitch and speed,"
-    " and differ in order to turn."
+    "It first rolls back to lean forward, then speeds up. The torques feed back pitch and speed; their"
+    " difference turns it."
 )
 
 
 class TwoWheeledPendulum(jj.Scene):
-    """x, y under the middle of the axle, heading, pitch of the body, angles of the wheels. Inputs: `speed`
-    wanted (m/s), `turn` torque of one wheel (N m).
+    """Coordinates: x, y under the middle of the axle, heading, pitch of the body, angles of the wheels.
+    Inputs: the desired `speed` (m/s), `turn` torque of one wheel (N m).
     """
 
     body_mass: float = jj.parameter(40.0, unit="kg", positive=True)

@@ -1,10 +1,10 @@
-"""A unicycle with a heavy rim and a rider who balances fore and aft by the pedals; sideways the turning wheel
-alone holds it up.
+"""A unicycle with a heavy rim and a rider who balances fore and aft by the pedals. Sideways, only the spin of
+the wheel stabilises it.
 
-With S = m_w r + m (r + h), straight running at the spin w leans as A lean'' = (S g - (I + S r) I w^2 / (D +
-J_z)) lean: it stands above the spin at which the bracket vanishes. Without a rider this is the rolling disc's
-w^2 = g / (3 r). Source: the disc's of J. I. Neimark and N. A. Fufaev (1972), with a rider added by the same
-two equations of moments.
+With S = m_w r + m (r + h), the lean in straight running at the spin w obeys A lean'' = (S g - (I + S r) I w^2
+/ (D + J_z)) lean: it is stable above the spin at which the bracket vanishes. Without a rider this is the
+rolling disc's w^2 = g / (3 r). Source: the equations of the disc by J. I. Neimark and N. A. Fufaev (1972),
+with a rider added to the same two equations of moments.
 """
 
 import jax.numpy as jnp
@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 LOOK = (
-    "It weaves but does not fall: the wheel turns faster than the critical spin. Start it at `spin_rate=3.0`"
-    " and it falls."
+    "It weaves but does not fall, since the wheel turns faster than the critical spin. From `spin_rate=3.0`"
+    " it falls."
 )
 
 
 class Unicycle(jj.Scene):
-    """x, y of the contact; yaw and lean of the wheel; pitch of the rider; spin of the wheel. Input: `pedals`,
-    a torque besides the rider's own (N m).
+    """Coordinates: x, y of the contact; yaw and lean of the wheel; pitch of the rider; spin of the wheel.
+    Input: `pedals`, a torque in addition to the rider's own (N m).
     """
 
     wheel_mass: float = jj.parameter(8.0, unit="kg", positive=True, about="all of it in the rim")

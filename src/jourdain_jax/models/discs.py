@@ -113,8 +113,6 @@ _TILTED = TiltingDisc.example
 class TiltingDiscQuaternion(_ThinDisc):
     """A thin disc that rolls without slip on a level plane, described as a free body.
 
-    It has position, quaternion, and constraints for the contact.
-
     One height constraint and two no-slip constraints on six speeds leave three degrees of freedom, with the
     motion of `TiltingDisc`. The coordinates are regular everywhere, so that the scene is valid until the disc
     lies flat and the contact point is undefined. Source: Wang and Pao (2003), section V; R. Cushman and J. J.

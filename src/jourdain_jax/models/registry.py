@@ -1,4 +1,4 @@
-"""All models by name."""
+"""The registry of all models by name."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields

@@ -319,7 +319,7 @@ class Design(Printed):
         return int(self.samples)  # type: ignore[arg-type]
 
     def values(self, first: int = 0, last: int | None = None) -> dict[str, np.ndarray]:
-        """Return the values of samples `first` to `last` - 1 (default: all), by name, each of shape (last -
+        """Return name -> values of the samples `first` to `last` - 1 (default: all), shape (last -
         first,).
         """
         last = len(self) if last is None else last

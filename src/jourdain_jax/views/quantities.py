@@ -162,7 +162,7 @@ def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
 
 
 def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
-    """Return one panel per name in a column, or the user's axes if given."""
+    """Return axes for each name: the user's, or one panel per name in a column."""
     if axes is None:
         size = 7.0, 1.2 + height * len(names)
         axes = pyplot().subplots(

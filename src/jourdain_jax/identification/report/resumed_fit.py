@@ -1,4 +1,4 @@
-"""Resumed fits: predictions for other runs, shares of information, and profiles.
+"""Results of resumed fits: predictions for other runs, shares of information, and profiles.
 
 Predictions for other runs:
 
