@@ -42,7 +42,7 @@ class _Leaves(NamedTuple):
     rest: tuple
 
     def whole(self, leaves: Sequence):
-        """Return the arguments with these arrays."""
+        """Return the arguments with `leaves` as their arrays."""
         return eqx.combine(jax.tree.unflatten(self.treedef, leaves), self.rest)
 
 
@@ -141,7 +141,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
     """Return `run`, which JAX cannot differentiate, with first and second derivatives in both
     modes by `rules`.
 
-    It takes trees of arrays and other objects, and returns trees of arrays.
+    The returned function takes trees of arrays and other objects, and returns trees of arrays.
     """
 
     def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):

@@ -57,8 +57,8 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
 def parts_of_scan(equation) -> tuple[int, int]:
     """Return the numbers of constant and of carried inputs of a scan.
 
-    They are counted by rank, because parameter names differ between versions of JAX: only scanned inputs lose
-    an axis inside the body.
+    Scanned inputs are recognised by the axis that they lose inside the body, because parameter names differ
+    between versions of JAX.
     """
     body = equation.params["jaxpr"].jaxpr
     whole, carried = (

@@ -204,8 +204,8 @@ class BothWays(NamedTuple):
     places: list[int]  # of the real numbers among the results
 
     def pushes(self, moving: list[int]) -> LinearMap:
-        """Return the Jacobian-vector product as a linear map of the tangents of the moving leaves. It depends
-        on the leaves and the result.
+        """Return the Jacobian-vector product as a linear map of the tangents of the moving leaves. The map
+        also depends on the leaves and the result.
         """
 
         def pushed(at, along):
@@ -230,8 +230,8 @@ class BothWays(NamedTuple):
         )
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of Jacobian-vector products with respect to other leaves. It also depends on
-        the tangents.
+        """Return the derivative of Jacobian-vector products with respect to other leaves. The derivative also
+        depends on the tangents.
         """
         count = len(self.leaves) + len(self.found)
 
@@ -245,8 +245,8 @@ class BothWays(NamedTuple):
         )
 
     def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of vector-Jacobian products with respect to other leaves. It also depends on
-        the cotangents.
+        """Return the derivative of vector-Jacobian products with respect to other leaves. The derivative also
+        depends on the cotangents.
         """
         count, end = len(self.leaves), len(self.leaves) + len(self.found)
         if reason := self.reason_against_second([*moving, *others]):

@@ -34,8 +34,8 @@ from jourdain_jax.calculus.reals import Flag, Scalar
 
 
 def identity(name: str) -> Primitive:
-    """Return a primitive called `name` that returns its operands unchanged, also when batched. It has
-    no derivative.
+    """Return a primitive called `name` that returns its operands unchanged, also when batched. The primitive
+    has no derivative.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True

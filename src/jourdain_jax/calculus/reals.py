@@ -185,7 +185,7 @@ def has_unit(x) -> bool:
 
 
 def as_array(x, dtype):
-    """Return an array of this type: a NumPy array if concrete, a JAX array if traced."""
+    """Return an array of the given `dtype`: a NumPy array if concrete, a JAX array if traced."""
     return array_module(x).asarray(x, dtype)
 
 

@@ -12,12 +12,12 @@ Optimization (2006), section 10.3) has no derivative: differentiate at the root.
 the last sample has converged.
 
 `fixed_point` computes x together with D for the entries of a and x_0 that vary, so both modes of
-differentiation run one loop. If the iteration converges quadratically, each further step doubles the order
-of correct derivatives; two steps without change give derivatives up to the third. Once all samples have
-settled, the remaining steps are skipped, also under `vmap`.
+differentiation run one loop. If the iteration converges quadratically, each further step doubles the order of
+correct derivatives; two steps without change give derivatives up to the third. Once all samples have settled,
+the remaining steps are skipped, also under `vmap`.
 
-`nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal. It
-then drops small singular values.
+`nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal. In
+that case it drops small singular values.
 """
 
 from collections.abc import Callable
@@ -179,8 +179,8 @@ def smooth_root(
 def first_root(
     rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds
 ) -> tuple[Nearest, Count]:
-    """Return the root found from the first successful guess, and the index of this guess. If no search
-    succeeds, return its end with the smallest residuals.
+    """Return the root from the first of the `guesses` that leads to one, and the index of this guess. If none
+    does, return the end point with the smallest residuals.
 
     A root has residuals of at most `good`. Other arguments, including the `bounds`, as for `damped_search`.
     """

@@ -28,7 +28,7 @@ class Pattern:
 
     @classmethod
     def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int]) -> "Pattern":
-        """Return the pattern with entries at these (row, column) pairs."""
+        """Return the pattern of `entries`, given as (row, column) pairs."""
         rows, columns = np.array(list(entries), int).reshape(-1, 2).T
         return cls(rows, columns, shape)
 

@@ -144,10 +144,10 @@ def accelerations(
     - `usual`: typical lengths of the constraint rows; a row that is mere round-off relative to its typical
       length counts as zero (default: the scene's typical lengths).
 
-    It works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank. Check
-    `applicable` and `residual`, since a reduction that does not apply raises no error. Raises ValueError
-    for an unknown reduction, and for known parameters that give impossible bodies, loads or planes. Eqs.
-    (41), (68)-(70).
+    The function works under any nesting of jit, vmap, jvp and vjp, with exact derivatives at constant rank.
+    Check `applicable` and `residual`, since a reduction that does not apply raises no error. Raises
+    ValueError for an unknown reduction, and for known parameters that give impossible bodies, loads or
+    planes. Eqs. (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f

@@ -8,7 +8,7 @@ docs/paper_by_example.md).
 The constraints are functions of the velocities in a `Motion`, so one reverse pass per row gives the forces on
 all bodies. All vectors are in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
 
-The power that changes the energy T + V of a scene.
+`power` and the functions after it give the power that changes the energy T + V of a scene:
 
     d(T + V)/dt = sum F.v + L.omega + Q_k u_k                loads without a potential
                 + (A' lambda).u                              constraints that do work
@@ -28,7 +28,7 @@ computed without df/dt (`rate_of_work`, `stored_by_inputs`):
 
 Source: Wang and Pao (2003), eqs. (71)-(73).
 
-The equations of Newton and Euler for each body. Their residuals are the constraint force R and torque T:
+The residuals of the equations of Newton and Euler for a body are the constraint force R and torque T on it:
 
     R = m a - F,   T = I alpha + omega x I omega - L
 
@@ -101,8 +101,8 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
 
 def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
-    """Return the forces of the scene's own potential: `-dV/dr` and `-dV/dtheta` on the bodies, and `-N'
-    dV/dq` at fixed poses on the speeds.
+    """Return the forces of the scene's own potential: `-dV/dr` and `-dV/dtheta` on the bodies, and
+    `-N' dV/dq` at fixed poses on the speeds.
     """
     t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
     zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
@@ -233,8 +233,8 @@ def contact_forces(
 
     The tangential force is the multiplier of the no-slip constraints. With `height="row"` the normal force is
     the multiplier of the height constraint. With `height="coordinates"` it follows from the balance of forces
-    and moments of the bodies that the contact carries. The balance of forces is `sum N n = sum (m a - F -
-    R)`, with sums over all contacts of these bodies, and over the bodies.
+    and moments of the bodies that the contact carries. The balance of forces is
+    `sum N n = sum (m a - F - R)`, with sums over all contacts of these bodies, and over the bodies.
 
     If the balance does not determine the normal force (four wheels on a plane), the force has minimum norm,
     and `determined` is False. `determined` is also False if a moment remains that no contact can exert, such
@@ -340,7 +340,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 def rate_of_work(
     scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: Indices
 ) -> Scalar:
-    """Return the integrand of W, the work in the last formula of this module, in watts.
+    """Return the integrand of the work W in this module's docstring, in watts.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. They contribute by their forces.
     Their stored energy (`stored_by_inputs`) is added to the integral.

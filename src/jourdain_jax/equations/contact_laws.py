@@ -181,7 +181,7 @@ def _scales(G: Float[Array, "rows rows"]) -> tuple[Float[Array, "contacts"], Flo
 
 
 def _modes(law: Law, P: Float[Array, "contacts 3"]) -> Modes:
-    """Return the modes of contacts under these forces."""
+    """Return the modes of all contacts under the forces `P`."""
     normal, tangential = _scales(law.G)
     w = (law.G @ P.ravel() + law.b).reshape(-1, 3)
     N, T = P[:, 0] - (w[:, 0] - law.target) * normal, P[:, 1:] - w[:, 1:] * tangential[:, None]
@@ -217,7 +217,7 @@ def _improved(
 
 
 def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, "contacts"]:
-    """Return for each contact whether these forces satisfy the law, up to round-off."""
+    """Return for each contact whether the forces `P` satisfy the law in its mode, up to round-off."""
     normal, tangential = _scales(law.G)
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction
     least = ROUND_OFF * jnp.sum(jnp.abs(law.b))

@@ -49,8 +49,8 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
 
 @eager_if_concrete
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """Return M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at `udot =
-    0`; (12)-(17).
+    """Return M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at
+    `udot = 0`; (12)-(17).
 
     `inputs`: values of the scene's inputs (default: zero).
     """

@@ -136,8 +136,8 @@ def partial_velocities(scene: Scene, t, q, u) -> Velocities:
 
 
 def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
-    """Return velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot,
-    0)`.
+    """Return velocities, and accelerations at `udot = 0`: the derivative of the velocities along
+    `(1, qdot, 0)`.
     """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     qdot = coordinate_rates(scene, t, q, u)

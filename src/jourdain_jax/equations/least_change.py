@@ -38,8 +38,8 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """Return the least change of the `free` entries, in the metric `M`, that removes the residual r. It is
-    differentiable in any mode at constant rank.
+    """Return the least change of the `free` entries, in the metric `M`, that removes the residual r. The
+    result is differentiable in any mode at constant rank.
 
     - `M`: None for the Euclidean metric of the coordinates. The identity replaces a singular `M`.
     - `typical`: typical lengths of the rows, in scaled speeds with a metric; a row that is mere round-off

@@ -17,10 +17,10 @@ A phase ends when one of the values in its line falls through zero; the head of 
 The event `speed` also ends the motion of a disc or wheel that falls flat.
 
 The direction of slip e is part of the state, with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e rotated by a right
-angle (`slip_turns`). Errors of w_t across e therefore do not turn it. The rate has no limit at rest: below
+angle (`slip_turns`). Errors of w_t across e therefore do not change e. The rate has no limit at rest: below
 the speed s, s replaces e.w_t.
 
-Impacts: speeds, modes and directions of slip after a contact closes.
+When a contact closes, the impact changes speeds, modes and directions of slip:
 
     u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
 
@@ -29,7 +29,7 @@ take part with restitution 0 (`coulomb` in `contact_laws.py`). For a single cont
 may integrate over the normal impulse instead. Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications
 (1988).
 
-The switching contacts at one state: their modes and their response to forces.
+`At` holds the switching contacts at one state: their modes and their response to forces.
 """
 
 from typing import NamedTuple
@@ -322,7 +322,7 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 
 
 def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
-    """Return `u + M^-1 A' T P` with `(T G T + 1 - T) P = -T w`, for contacts in these modes.
+    """Return `u + M^-1 A' T P` with `(T G T + 1 - T) P = -T w`, for contacts in the modes `number`.
 
     T projects the speeds w onto the parts that must vanish: normal speeds of closed contacts, slip of rolling
     contacts, and slip across e of slipping contacts.

@@ -266,9 +266,9 @@ class NullSpaceQR(Reduction):
     """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`,
     `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
 
-    It applies wherever `Z'MZ` is positive definite. The result does not depend on the choice of Z, since `F -
-    m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: relative size of singular values below
-    which scaled rows count as dependent (default: round-off, `rank_cutoff`).
+    It applies wherever `Z'MZ` is positive definite. The result does not depend on the choice of Z, since
+    `F - m a` is orthogonal to the whole null space, (71)-(73). `cutoff`: relative size of singular values
+    below which scaled rows count as dependent (default: round-off, `rank_cutoff`).
     """
 
     cutoff: float | None = eqx.field(static=True, default=None)

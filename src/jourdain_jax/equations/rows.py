@@ -48,7 +48,7 @@ class ConstraintRows(eqx.Module):
     usual: UsualRows | None = None  # None: each row is scaled by its length at this state
 
     def judged_by(self, usual: UsualRows | None) -> "ConstraintRows":
-        """Return these rows with the reference `usual` (`structure.usual_rows`)."""
+        """Return the same rows with the reference `usual` (`structure.usual_rows`)."""
         return ConstraintRows(self.phi, self.A, self.drift, self.names, usual)
 
 

@@ -1,5 +1,5 @@
-"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible virtual
-velocity.
+"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible
+virtual velocity.
 
     sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k
         =  M udot + h - Q                                                                         (50), (56)
@@ -11,13 +11,13 @@ velocity.
 a_0, alpha_0 in h come from a second directional derivative, never from dM/dq. Angular quantities are in body
 axes. Source: Wang and Pao (2003), eqs. (18), (50), (56).
 
-Lagrange's equations in energy-derivative form, for scenes whose speeds are the coordinate rates (S2 of
-docs/paper_by_example.md).
+Lagrange's equations in energy-derivative form hold for scenes whose speeds are the coordinate rates (S2 of
+docs/paper_by_example.md):
 
     d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
 
-They give M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, and h is `d/dt(dT/dqdot) -
-dT/dq` at qddot = 0. Source: Wang and Pao (2003), eq. (11).
+They give M, h and Q independently of Jourdain's principle: `M = d2T/dqdot2`, and h is
+`d/dt(dT/dqdot) - dT/dq` at qddot = 0. Source: Wang and Pao (2003), eq. (11).
 """
 
 import equinox as eqx
@@ -217,8 +217,8 @@ def _generalized_forces(
 
 
 class ContactResponse(eqx.Module):
-    """Response of switching contacts to their forces L at one state: `du/dt = free + impulses L`, `dw/dt = G
-    L + b`.
+    """Response of switching contacts to their forces L at one state: `du/dt = free + impulses L`,
+    `dw/dt = G L + b`.
     """
 
     rows: ContactRows
@@ -311,8 +311,8 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
-    """Return all impressed forces, torques (body axes) and forces on the speeds. The latter include `-N'
-    dV/dq` of the scene's own potential. `loads`: as in `resultants`.
+    """Return all impressed forces, torques (body axes) and forces on the speeds. The latter include
+    `-N' dV/dq` of the scene's own potential. `loads`: as in `resultants`.
     """
     total = resultants(scene, motion, loads=loads)
     orientation = of_bodies(motion, "orientation")
@@ -347,8 +347,8 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
 
 @eager_if_concrete
 def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq =
-    Q`; eq. (11).
+    """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy:
+    `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
 
     `inputs`: values of the scene's inputs (default: zero). Raises ValueError if the speeds are not the
     coordinate rates.

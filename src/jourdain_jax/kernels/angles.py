@@ -2,10 +2,10 @@
 double-double arithmetic.
 
 Whole quarter turns are subtracted from an angle, with pi/2 in the three parts of `program/emit.py`; the
-remainder has two parts. This is exact while the multiple of pi/2 has 20 bits. Larger angles are multiplied by
-the relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and cosine use the
-minimax polynomials of `program/emit.py`. Arcs use Chebyshev polynomials P of 12 and 13 terms, from mpmath's
-`chebyfit`, which a test reproduces:
+remainder has two parts. The reduction is exact while the multiple of pi/2 has 20 bits. Larger angles are
+multiplied by the relevant bits of 2/pi (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18 (1983) 19). Sine and
+cosine use the minimax polynomials of `program/emit.py`. Arcs use Chebyshev polynomials P of 12 and 13 terms,
+from mpmath's `chebyfit`, which a test reproduces:
 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
     asin s = s + s^3 P(s^2) for |s| < 1/2,         otherwise   asin s = pi/2 - 2 asin sqrt((1 - s)/2)

@@ -318,8 +318,8 @@ def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane)
 
 
 def write_rows(w: Writer, given: int, returned: int) -> None:
-    """Write a handler that maps rows of `given` numbers to rows of `returned` numbers. It calls the module's
-    `row(given, returned)` for several lanes at once.
+    """Write a handler that maps rows of `given` numbers to rows of `returned` numbers. The handler calls the
+    module's `row(given, returned)` for several lanes at once.
 
     Lanes beyond the last row repeat that row.
     """

@@ -181,8 +181,8 @@ def folder() -> Path | None:
 
 
 def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
-    """Return the content of the cache file of this name. If it is missing or damaged, return `make()`, and
-    store it. Disk errors are ignored.
+    """Return the content of the cache file `name`. If it is missing or damaged, return `make()`, and store
+    it. Disk errors are ignored.
 
     `made_by`: versions of the tools, as text; content of other versions counts as damaged.
     """

@@ -150,7 +150,7 @@ class Writer:
         return Value(self, type, f"%v{self._count}")
 
     def literal(self, number, type: str) -> Value:
-        """Return a Python number as a literal of this type; values pass unchanged."""
+        """Return a Python number as a literal of the given `type`; values pass unchanged."""
         if isinstance(number, Value):
             return number
         scalar = type.split(" x ")[-1].rstrip(">")
@@ -319,7 +319,7 @@ class Writer:
         return Value(self, "ptr", f"%v{self._count}")
 
     def at(self, pointer: Value, index, type: str = "") -> Value:
-        """Return a pointer to the value with this index."""
+        """Return a pointer to the value with the given `index`."""
         type = type or self.real
         return self.instruction(
             "ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}"

@@ -15,7 +15,7 @@ COMPARED = {
 
 
 def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
-    """Return the method that appends this operation or comparison; `turned`: with swapped operands."""
+    """Return the method that appends the operation or comparison `op`; `turned`: with swapped operands."""
 
     def appended(self: "Value", other) -> "Value":
         a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)

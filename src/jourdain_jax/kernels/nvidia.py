@@ -151,7 +151,7 @@ def _in_context() -> Iterator[None]:
 
 
 def loaded(text: bytes, name: str) -> Loaded:
-    """Return the kernel of this name in PTX."""
+    """Return the kernel called `name` in PTX."""
     with _in_context():
         library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
         _checked(

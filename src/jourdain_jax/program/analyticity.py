@@ -14,8 +14,8 @@ CALLS = frozenset({"opaque"})
 
 
 def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list[bool]:
-    """Return, for each output, whether an operation of these kinds occurs in a part that depends on time,
-    state or inputs.
+    """Return, for each output, whether an operation of the given `kinds` occurs in a part that depends on
+    time, state or inputs.
     """
     return _with(graph, outputs, lambda n: graph.op[n] in kinds and graph.varies[n])
 
@@ -23,7 +23,7 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
 def decided_by(
     graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]
 ) -> bool:
-    """Return whether any operation of these kinds in the outputs depends on one of the variables."""
+    """Return whether any operation of the given `kinds` in the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
     decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
     return any(depend_on(graph, decisions, variables))

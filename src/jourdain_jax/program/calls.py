@@ -5,10 +5,9 @@
 
 Values may have batch axes, which come last.
 
-Interpreter of a jaxpr over scalars that keeps parts without scalar form as calls of JAX.
-
-An equation without a rule is opaque. Equations that exchange large arrays with it, and equations between two
-opaque ones, become opaque as well, so a neural network is one call. Each equation has a level:
+`interpret_with_calls` keeps parts of a jaxpr without scalar form as calls of JAX. An equation without a rule
+is opaque. Equations that exchange large arrays with it, and equations between two opaque ones, become opaque
+as well, so a neural network is one call. Each equation has a level:
 
     of scalars        the largest level of its operands
     opaque            the same, but one more than the level of a scalar operand

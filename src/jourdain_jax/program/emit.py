@@ -8,9 +8,7 @@ Sine and cosine of one argument are computed together. In double precision they 
 in three parts and polynomials, with an error of about 2e-16; XLA on CPUs would call libm once per element and
 again in every fusion.
 
-Several values of one shape, computed in one loop over their elements. Their shared parts are
-computed once.
-
+Values of one shape are computed in one loop over their elements, and their shared parts once.
 XLA on CPUs makes a separate loop for each result of a program and repeats shared parts in each, but it makes
 one loop for a reduction over several operands. Therefore each value is padded with a zero, and all are summed
 over value and zero in one reduction. JAX treats this as the identity, which is linear and elementwise.

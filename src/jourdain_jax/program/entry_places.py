@@ -8,7 +8,8 @@ import numpy as np
 
 
 def places(shape: Sequence[int], indices: np.ndarray, sizes: Sequence[int], axes, lanes, mode) -> np.ndarray:
-    """Return the flat places of windows in an array of this shape; their axes follow the axes of the indices.
+    """Return the flat places of windows in an array of the given `shape`; their axes follow the axes of
+    the indices.
 
     The windows have the given sizes and begin at `indices` along `axes`. A window beyond the array has places
     -1, unless the mode moves it inside. `lanes`: pairs of a batch axis of the array and of the indices.

@@ -1,6 +1,6 @@
 """Evaluation of nodes on NumPy arrays, at all probes at once, without compilation.
 
-Parts of a graph that some nodes need: extraction, and comparison of their sizes.
+The module also extracts the parts of a graph that some nodes need, and compares their sizes.
 """
 
 import heapq

@@ -258,7 +258,7 @@ class Graph:
     # arrays and calls
 
     def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
-        """Combine scalars into an array, or return the existing array of exactly these entries."""
+        """Combine scalars into an array, or return the existing array of exactly the same entries."""
         entries = tuple(entries)
         if entries and self.op[entries[0]] == "entry":
             (whole,) = self.args[entries[0]]
@@ -268,7 +268,7 @@ class Graph:
         return self._node("array", entries, (shape, dtype))
 
     def opaque(self, call, operands: Iterable[int]) -> int:
-        """Return the node of a call with these arrays as operands."""
+        """Return the node of a call whose `operands` are arrays."""
         return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> NodeList:

@@ -4,7 +4,7 @@ entries.
 Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive
 without a rule raises `Unsupported`; `calls.py` then keeps its surroundings as a call.
 
-Reductions of arrays of nodes over axes (sums, products, extremes), and matrix products.
+Sums, products and extremes over axes, and matrix products, are written out as nodes.
 """
 
 import os

@@ -196,7 +196,7 @@ def _select(equation, which, *cases):
 
 
 def _window(x, starts, sizes) -> tuple[slice, ...]:
-    """Return slices of these sizes starting at `starts`, shifted into the array if necessary."""
+    """Return slices of the given `sizes` starting at `starts`, shifted into the array if necessary."""
     begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
     return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 

@@ -3,8 +3,8 @@ short expression.
 
 Atoms are inputs and all nodes other than sums, differences and products: sines, cosines, square roots,
 reciprocals. Expansion cancels equal terms. Reconstruction groups terms by their varying part, whose
-coefficient (a polynomial in parameters) is computed once per motion. It then factors greedily (multivariate
-Horner scheme).
+coefficient (a polynomial in parameters) is computed once per motion. The result is then factored greedily
+(multivariate Horner scheme).
 """
 
 from collections import Counter

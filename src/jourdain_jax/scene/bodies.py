@@ -3,9 +3,8 @@ automatic differentiation.
 
 A body states its pose in the inertial frame; `outline` is a line in the body frame, for drawing only.
 
-Shapes of bodies, in the body frame, for pictures only.
-
-A scene returns them from `visuals(self, pose)`. Bodies without shapes are drawn from their `outline`, the
+Shapes of bodies, such as `Box`, are in the body frame and for pictures only. A scene returns them from
+`visuals(self, pose)`. Bodies without shapes are drawn from their `outline`, the
 shapes of their contacts, or their inertia.
 """
 

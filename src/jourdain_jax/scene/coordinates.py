@@ -1,12 +1,12 @@
-"""Names of generalized coordinates `q` and generalized speeds `u`, and the default speeds of coordinates.
+"""Names of generalized coordinates `q` and generalized speeds `u`, the default speeds of coordinates, and the
+physical parameters of a scene.
 
-A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has the three body components
-of the angular velocity as speeds, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude
-(0, omega)`.
+A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has the three body components of
+the angular velocity as speeds, `attitude_omega_x`, `..._y`, `..._z`, with
+`d attitude/dt = 1/2 attitude (0, omega)`.
 
-Named access to flat arrays, and error messages that list the valid and the nearest names.
-
-Physical parameters of a scene: differentiable leaves, checked where their values are known.
+Names select entries of flat arrays; the message about an unknown name lists the valid and the nearest names.
+Parameters are differentiable leaves, checked where their values are known.
 """
 
 import difflib
@@ -167,8 +167,8 @@ class Coordinates:
         return q
 
     def default_rates(self, q: Float[Array, "coordinates"], u: Speeds) -> Float[Array, "coordinates"]:
-        """Return `qdot` from the default speeds: `xdot = x_rate`, `d quaternion/dt = 1/2 quaternion (0,
-        omega)`.
+        """Return `qdot` from the default speeds: `xdot = x_rate`,
+        `d quaternion/dt = 1/2 quaternion (0, omega)`.
         """
         parts: list[tuple[int, Array]] = [(i, u[k : k + 1]) for i, k in self.plain]
         parts += [(i, quaternion_rate(q[i : i + 4], u[k : k + 3])) for i, k in self.quaternions]

@@ -42,8 +42,8 @@ def clear_caches() -> None:
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
-    """Decorate a function so that it runs once per class, parameter values and further keys. It gets concrete
-    parameters, even during tracing.
+    """Decorate a function so that it runs once per class, parameter values and further keys. The function
+    gets concrete parameters, even during tracing.
 
     `of_traced`: a function that is called instead, without caching, for scenes with traced parameters.
     """

@@ -2,18 +2,17 @@
 generalized forces on speeds.
 
 A load has forces F at the mass centres (`forces`), torques L (`torques`), and generalized forces Q_k on the
-speeds u_k (`generalized`). Its virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a
-`potential` is conservative, and its potential is part of the potential energy V. The work of other loads is
-integrated along the motion.
+speeds u_k (`generalized`). The virtual power of a load is `sum F . dv + sum L . domega + sum Q_k du_k`. A
+load with a `potential` is conservative, and its potential is part of the potential energy V. The work of
+other loads is integrated along the motion.
 
-Ready-made constraints.
+Ready-made constraints are functions whose value is zero while the constraint holds. A geometric constraint is
+a function of a `Pose`; return it by name from `geometric_constraints` of a scene. The engine differentiates
+it with respect to time. A velocity constraint is a function of a `Motion`; return it by name from
+`velocity_constraints`.
 
-Each function returns a value that is zero while the constraint holds. A geometric constraint is a function of
-a `Pose`; return it by name from `geometric_constraints` of a scene. The engine differentiates it with respect
-to time. A velocity constraint is a function of a `Motion`; return it by name from `velocity_constraints`.
-
-Velocity constraints that hold until their force exceeds a limit: friction in joints, and blades that may
-slip sideways.
+Friction in joints, and blades that may slip sideways, are velocity constraints that hold until their force
+exceeds a limit:
 
     w = 0 while |L| <= F_static;   otherwise L = -F w/|w|        w: slip,  L: constraint force, N or N m
 
@@ -150,8 +149,8 @@ def damper(a: Point, b: Point, damping: Any) -> Load:
 
 
 def generalized_force(motion: Motion, **forces: Any) -> Load:
-    """Return the load of generalized forces Q_k on speeds, by name: `generalized_force(motion,
-    steer_rate=torque)`. Its power is `sum Q_k u_k`; it has no potential.
+    """Return the load of generalized forces Q_k on speeds, by name:
+    `generalized_force(motion, steer_rate=torque)`. Its power is `sum Q_k u_k`; it has no potential.
 
     `forces`: speed -> force, in N or N m. Raises ValueError for an unknown speed.
     """
@@ -228,8 +227,8 @@ class JointFriction(Load):
 def joint_friction(motion: Motion, **friction: Any) -> JointFriction:
     """Return Coulomb friction on speeds by name: `joint_friction(motion, hinge_rate=0.3)`.
 
-    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or `jj.Coulomb(sliding,
-      static)` with two forces.
+    - `friction`: speed -> force F in N or N m, a number or a function of the motion, or
+      `jj.Coulomb(sliding, static)` with two forces.
 
     The force Q on a speed u is `-F u/|u|`. A speed of zero stays zero as long as a force with `|Q| <= F` can
     hold it. `motion.phase("hinge_rate")` returns whether the speed holds or slips. Raises ValueError for an

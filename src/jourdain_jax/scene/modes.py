@@ -51,8 +51,8 @@ class Modes:
 def modes(**values) -> Modes:
     """Declare modes: name -> names of its values. A motion starts with the first value.
 
-    `motion.modes.name` is the number of the value: constant between events, and switched by `jj.Event(...,
-    to={name: value})`. `inputs={name: value}` starts a motion with another value.
+    `motion.modes.name` is the number of the value: constant between events, and switched by
+    `jj.Event(..., to={name: value})`. `inputs={name: value}` starts a motion with another value.
 
     **Examples**
 

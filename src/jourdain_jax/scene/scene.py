@@ -72,10 +72,10 @@ class Scene(eqx.Module):
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
     As everywhere in JAX, methods are traced once, and values from outside the fields of the scene become
-    constants. A method may itself read global names and variables of an enclosing function. If their values
-    are numbers, texts, functions or tuples of these, the next call notices a change. It also notices a
-    changed method, for example after `%autoreload`. If they are arrays, lists, dictionaries or objects with
-    state, the scene raises an error; make them parameters or static fields. Call `jj.clear_caches()` after
+    constants. A method may itself read global names and variables of an enclosing function. If these hold
+    numbers, texts, functions or tuples of them, the next call notices a change. If they hold arrays, lists,
+    dictionaries or objects with state, the scene raises an error; make them parameters or static fields. The
+    next call also notices a changed method, for example after `%autoreload`. Call `jj.clear_caches()` after
     changing anything else: values that helper functions read, attributes of modules and classes, or files.
     """
 

@@ -35,7 +35,7 @@ class Spline(eqx.Module):
     - `ts`: knots, s, increasing; `values`: one number per knot. Two knots give a line, three a parabola, more
       a cubic spline.
 
-    It is differentiable with respect to `values` and `ts`. It can be a field of a scene, a value in its
+    A spline is differentiable with respect to `values` and `ts`. It can be a field of a scene, a value in its
     methods, or an input. For samples of a smooth motion at intervals h its error is of order h^4.
 
     **Raises** ValueError for other shapes, times that do not increase, or numbers that are not finite.

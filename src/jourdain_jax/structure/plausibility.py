@@ -8,8 +8,8 @@
     I_3 <= I_1 + I_2
     x' M x > 0 for motions x with A x = 0
 
-The table `CHECKS` contains these checks as functions of numbers at some states. They run when a scene is
-probed, and a fault raises an error with the message of its check. Checks with a `label` also run in the
+The table `CHECKS` contains these checks as functions of numbers at some states. The checks run when a scene
+is probed, and a fault raises an error with the message of its check. Checks with a `label` also run in the
 compiled program of each motion, where a fault becomes a result code. There they run at the start and, since
 the start may hide a fault, at random states of the domain on the geometric constraints.
 """
@@ -307,7 +307,7 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
-    """Return for each fault whether it occurs at this state or at a state from `elsewhere`, with the
+    """Return for each fault whether it occurs at (t, q, u), or at a state from `elsewhere` with the
     coordinates `others`. This works under jit and vmap. NaN does not count as a fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))

@@ -150,8 +150,8 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: SparseRows) -> frozenset[str]:
-    """Return the quantities in which operations of these kinds occur, by name: as in `vanishing`, "rank" for
-    the Jacobian of the constraints, and "nonlinear" for its dependence on the speeds.
+    """Return the quantities in which operations of the given `kinds` occur, by name: as in `vanishing`,
+    "rank" for the Jacobian of the constraints, and "nonlinear" for its dependence on the speeds.
     """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
@@ -186,11 +186,11 @@ def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Ass
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
-    """Return whether these velocity constraints are combinations of the others at all states on the geometric
-    constraints, at generic parameters.
+    """Return whether the velocity constraints `rows` are combinations of the others at all states on the
+    geometric constraints, at generic parameters.
 
-    Row s is a combination of the kept rows k if `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` has a solution x up to
-    round-off.
+    Row s is a combination of the kept rows k if `(A_s, phi_s(0)) = x' (A_k, phi_k(0))` has a solution x up
+    to round-off.
     """
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced
@@ -256,7 +256,7 @@ class _AtStates:
         return np.asarray(x, real_type())
 
     def _matrices(self, probes: Probes, entries: SparseRows, columns: list[int]) -> np.ndarray:
-        """Return matrices with these entries by row, with a leading axis of states."""
+        """Return matrices with the given `entries`, listed by row; they have a leading axis of states."""
         place = {n: k for k, n in enumerate(columns)}
         found = np.zeros((probes.count, len(entries), len(columns)))
         places = [(i, place[n], node) for i, row in enumerate(entries) for n, node in row.items()]
@@ -266,7 +266,7 @@ class _AtStates:
         return found
 
     def _row_matrices(self, probes: Probes) -> np.ndarray:
-        """Return A at these probes."""
+        """Return A at the given `probes`."""
         return self._matrices(probes, self.nodes.rows, self.traced.u.tolist())
 
     def _mass_matrix(self) -> np.ndarray:

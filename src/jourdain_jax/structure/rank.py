@@ -2,7 +2,7 @@
 
 A^ = d A c,  M^ = c M c        scaled rows, and inertias in scaled speeds (`reductions.py`)
 
-Probes of a scene and their findings: quantities that vanish or change, and speeds without inertia.
+The same probes show which quantities vanish or change, and which speeds have no inertia.
 """
 
 import itertools
@@ -132,8 +132,8 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Return the coefficients of row s as a combination of the rows `rest`, at states of this rank. They
-    refer to rows in units of their typical lengths, and are infinite where row s is not a combination.
+    """Return the coefficients of row s as a combination of the rows `rest`, at states of the given `rank`.
+    They refer to rows in units of their typical lengths, and are infinite where row s is not a combination.
     """
     tiny, made = tiny_of(found.A), []
     lengths = np.maximum(found.lengths, tiny)

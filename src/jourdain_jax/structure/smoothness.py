@@ -101,9 +101,9 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _across(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return intervals on 6 lines across the bounding box of the states `q`, 48 on each, at random times.
 
-    The lines are projected onto the geometric constraints. Off them a constraint may jump at states that no
-    motion reaches, for example inside a body on which others roll. Intervals with an end that does not
-    converge, or with ends far apart, are omitted.
+    The lines are projected onto the geometric constraints. Off the constraints a quantity may jump at states
+    that no motion reaches, for example inside a body on which others roll. Intervals with an end that does
+    not converge, or with ends far apart, are omitted.
     """
     generator, lines, across = np.random.default_rng(3), 6, 48
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, lines, q.shape[1]))

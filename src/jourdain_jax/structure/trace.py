@@ -240,8 +240,8 @@ def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
 
 
 def jaxpr_of_scene(scene: Scene, of_inputs: Indices):
-    """Return a jaxpr of the scene's quantities, and their shapes. It is a function of the parameters (one
-    input per leaf), t, q, u and inputs.
+    """Return a jaxpr of the scene's quantities, and their shapes. The jaxpr is a function of the parameters
+    (one input per leaf), t, q, u and inputs.
 
     `of_inputs`: indices of the loads whose potential depends on inputs. Raises ValueError if a method reads a
     value that JAX traces elsewhere.

@@ -189,8 +189,8 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in
       `ball_contact`.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    height.
+    The contact has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an
+    unknown height.
     """
 
     def ellipsoid(centre) -> Ellipsoid:
@@ -212,8 +212,8 @@ def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unp
     - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in
       `ball_contact`.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    axis or height.
+    The contact has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an
+    unknown axis or height.
     """
     return rolling(
         body,
@@ -236,8 +236,8 @@ def wheel_contact(
     - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or
       "z". `options`: as in `ball_contact`.
 
-    It has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an unknown
-    axis or height.
+    The contact has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an
+    unknown axis or height.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
     return rolling(

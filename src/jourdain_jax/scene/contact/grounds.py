@@ -5,8 +5,9 @@ rest or in rigid motion.
     n x p = t1, t2          two unit tangents: the directions of the no-slip constraints
 
 The motion of a ground must be given twice: by its shape as a function of time, and by `velocity` and
-`angular_velocity`. These also include motion within the ground, as of a belt or a turntable. Their normal
-part must agree with the motion of the shape; this is checked when the scene is probed.
+`angular_velocity`. The two vectors also include motion within the ground, such as that of a belt or a
+turntable. Along the normal they must agree with the motion of the shape; this is checked when the
+scene is probed.
 """
 
 from abc import abstractmethod
@@ -86,10 +87,10 @@ class Plane(_Ground):
       the plane, and across it. By default they act along the x and y axes, rotated by `tilt`, or by the
       shortest rotation of z to the given normal n (of -z if n points down).
 
-    The motion of a plane must be given twice: by `origin` and `tilt` or `normal` as functions of time,
-    and by `velocity` and `angular_velocity`. These also include motion within the plane, as of a belt or
-    a turntable. Their normal part must agree with the motion of the shape; this is checked when the
-    scene is probed.
+    The motion of a plane must be given twice: by `origin` and `tilt` or `normal` as functions of time, and by
+    `velocity` and `angular_velocity`. The two vectors also include motion within the plane, such as that of a
+    belt or a turntable. Along the normal they must agree with the motion of the plane; this is checked when
+    the scene is probed.
 
     Raises ValueError for an `along` normal to the plane, for both `tilt` and `normal`, and, when the scene is
     built, for a normal that is not a unit vector.
