@@ -26,8 +26,7 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     (S, turned), constant = perturbations(scene), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
-    # derivatives along all perturbations (ds, du, df); T: all perturbations as functions of the independent
-    # ones
+    # derivatives along all perturbations (ds, du, df); T: all perturbations from the independent ones
     along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
     T = eliminated(
         along[np.concatenate([at.geometric, at.phi])],

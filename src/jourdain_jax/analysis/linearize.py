@@ -233,9 +233,9 @@ def linearize(
 
     **Arguments**
 
-    - `state`: a state on the constraints. If only ignorable coordinates move, such as the yaw and the spin of
-      a disc, the motion is steady and the matrices are constant along it. Otherwise they hold only at this
-      instant, and `residual` measures the deviation.
+    - `state`: a state on the constraints. In a steady motion, only ignorable coordinates change, such as the
+      yaw and the spin of a disc, and the matrices are constant. If the state is not steady, the matrices hold
+      only at this instant, and `residual` measures the deviation.
     - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is
       independent. A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body
       axes.

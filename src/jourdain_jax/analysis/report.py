@@ -75,9 +75,7 @@ class Report(Printed):
     privileged_velocities: Labels
     privileged_by_user: bool
     lowering: str  # number of operations of the scalar program and how it is integrated, or why there is none
-    worst_pivot: (
-        float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
-    )
+    worst_pivot: float  # smallest singular value of the scaled A_z over all probes; zero: singular somewhere
     typical_pivot: float
     rank_losses: Labels  # probed configurations at which the constraints lose rank
     # at the given start, or at the scene's example if its rank differs; otherwise None

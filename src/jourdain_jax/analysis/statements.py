@@ -6,8 +6,8 @@ potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i
 derivatives    d/ds of each quantity along one direction in (parameters, t, q, u): autodiff agrees with
                central differences, and there is no kink
 
-Check derivatives of accelerations and constraint forces: whether they exist, whether forward and reverse
-mode agree, and whether they agree with central differences.
+Derivatives of accelerations and constraint forces are checked, too: whether they exist, whether forward and
+reverse mode agree, and whether they agree with central differences.
 """
 
 from collections.abc import Callable
@@ -277,8 +277,7 @@ def _name(i: int, load: Load) -> str:
 
 def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
     """Return all quantities that the scene defines at (t, q, u), by subject."""
-    # `pose_at`, because poses in a motion are differentiated already, which may bypass a custom derivative
-    # rule
+    # `pose_at`, because poses in a motion are differentiated already, which may bypass a custom rule
     motion, pose = motion_at(scene, t, q, u, inputs), pose_at(scene, t, q)
     pieces = {"the coordinate rates": coordinate_rates(scene, t, q, u)}
     for name, placed in pose.bodies.items():

@@ -135,7 +135,6 @@ def steady(
     check_names(carried := entries_of(scene, moving), entries, unknown)
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
     # no equation depends on these coordinates: they keep the value of the guess, so that no step diverges
-    # there
     idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)

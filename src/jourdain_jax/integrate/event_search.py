@@ -250,12 +250,11 @@ def monitored(
     ends = found
     if form.goes_on:
         goes = goes_on(w, form, changed["event"]) & (found | over)
-        # rounding may put an event just beyond its step: it happens at the end, and the state after it is
-        # saved
+        # rounding may put an event just beyond its step; it then happens at the end of the step
         now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
         changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
         follows = over & (p["passed"] + p["crossings"] > 0.0)
-        at_once = follows & ~goes  # right after a transition, whose time it shares
+        at_once = follows & ~goes  # at the same time as a transition before it
         ends = at_once | (found & ~goes)
         p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
         noise = reach_of_noise(w, p["last_goal"])
@@ -265,7 +264,7 @@ def monitored(
             [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)],
         )
         rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
-        side = is_side(w, form, changed["event"])  # one may vanish together with another
+        side = is_side(w, form, changed["event"])  # numbers of several relations may vanish together
         flat = ~side & (over | is_flat(w, rate, slope))
         quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
         passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)

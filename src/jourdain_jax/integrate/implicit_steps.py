@@ -1,12 +1,12 @@
-"""Base classes of the implicit methods of this package's loop. Newton's method solves the equations of a
-step.
+"""Implicit methods of this package's loop: base classes, Radau's method and the implicit midpoint rule.
+Newton's method solves the equations of a step.
 
 Batches run under `vmap`. Structure-preserving methods preserve an energy, a quadratic integral or a symmetry
 under time reversal, exactly or nearly. They need constant steps and have no error estimate, so the user gives
 a `step`. Between two times at which a step must end, they take the smallest number of equal steps that are
 not longer than `step`.
 
-Radau's method of order 5 for stiff motions: implicit, L-stable, three stages.
+Radau's method for stiff motions has order 5 and three stages, and is L-stable:
 
     z_i = h sum_j a_ij f(t_0 + c_j h, y_0 + z_j),   y_1 = y_0 + z_3
     e = (1 - h g J)^-1 (g h f(t_0, y_0) + g/3 (-13 - 7 sqrt 6, -13 + 7 sqrt 6, -1) . z)
@@ -15,7 +15,7 @@ Radau's method of order 5 for stiff motions: implicit, L-stable, three stages.
 The stages are collocation at the Radau nodes c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1). The error estimate e
 has order 3 and stays small for components that decay within one step.
 
-Implicit midpoint rule, for any form of the integrated state.
+The implicit midpoint rule applies to any form of the integrated state.
 """
 
 import abc

@@ -1,8 +1,7 @@
 """Inputs of a scene as functions of time: constants, callables, or linearly interpolated samples.
 
-Functions become programs; steps end at the knots of samples (`input_knots.py`).
-
-Functions of time as programs: operations, plain numbers and captured values.
+Steps end at the knots of samples (`input_knots.py`). Functions of time become programs, which consist of
+operations, plain numbers and captured values.
 
 A function of time is traced in each call that receives it. Captured values (arrays, traced numbers) and plain
 numbers in sums, products, quotients and comparisons become arguments of a program and have derivatives. The
@@ -210,7 +209,7 @@ class Mode(eqx.Module):
     value: Float[Array | np.ndarray, ""]
     ts: Float[Array, "transitions"] | None = None  # s, times `direction`; infinite after the last one
     values: Float[Array, "transitions"] | None = None
-    direction: Float[Array, ""] | None = None  # 1, or -1 if time runs backwards
+    direction: Float[Array, ""] | None = None  # 1, or -1 if time runs backward
 
     def __call__(self, t):
         """Return the index of the value at time t; at a transition, that of the new value."""

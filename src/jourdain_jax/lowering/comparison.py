@@ -1,7 +1,7 @@
 """Compare the rates of two programs, or of a program and dense matrices, at probes where both are valid.
 Differences are relative to the typical size of each rate.
 
-Make the probes, that is, states and parameters, at which candidates for a scalar program are compared.
+Probes are states with parameters. Candidates for a scalar program are compared at the probes made here.
 """
 
 import jax
@@ -97,8 +97,7 @@ def check_against_dense(
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
         raise NotLowered("its scalar program is valid at too few of the probed states")
-    # tolerance between the program, in double precision, and dense matrices, relative to the size of each
-    # rate
+    # tolerance of the program, in double precision, against dense matrices, relative to the size of each rate
     limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]

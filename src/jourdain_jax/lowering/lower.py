@@ -115,8 +115,8 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
             for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist())
         )
         if loop := next(filter(None, loops), None):
-            # because of a measurement: a ball on a hill, whose contact point is found by Newton's method,
-            # takes four times as long as with dense matrices
+            # measured: a ball on a hill, whose contact point is found by Newton's method, takes four times as
+            # long as with dense matrices
             raise Unsupported(f"the operation `{loop}`")
         probes = comparison_probes(scene, structure, traced)
         # at states that violate the velocity constraints, redundant constraints contradict each other

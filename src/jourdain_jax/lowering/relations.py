@@ -24,7 +24,7 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList
 
 MOST_WATCHED = 32  # maximum number of monitored relations of a scene
-# truth for a > b, and for a < b
+# values of comparisons if a > b, and if a < b
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}
 EQUAL = {"eq": (False, False), "ne": (True, True)}  # not monitored, unless the number also decides others
 COMPARED |= EQUAL

@@ -11,10 +11,8 @@ The branch does not change within a step: the event search ends the step where x
 change there as at any event (`integrate/loop/transitions.py`). Modelica treats relations in the same way. If
 a branch is undefined beyond x = 0, as with `sqrt`, its relation has the event but not the mode.
 
-Detect kinks and jumps of loads and masses, from relations (`<`, `abs`, `floor`, ...) in the traced scene.
-No lowered program is needed.
-
-Kinks inside a JAX call (`jnp.interp`, a callback) are not detected.
+Relations of the traced scene also show kinks and jumps of loads and masses, without a lowered program. Kinks
+inside a JAX call (`jnp.interp`, a callback) are not detected.
 """
 
 from dataclasses import replace

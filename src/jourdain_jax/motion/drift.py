@@ -47,8 +47,8 @@ MOST_STEP_ERRORS = 10  # largest drift, as a multiple of the errors of N steps a
 def conserves(setup: Setup) -> bool:
     """Return whether T + V is constant along a motion with step-size control.
 
-    False if work is integrated: it may be a small difference of large powers, so step-size control does not
-    bound its error.
+    False if work is integrated: work may be a small difference of large powers, so that step-size control
+    does not bound its error.
     """
     return (
         setup.field.conserves

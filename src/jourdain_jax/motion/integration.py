@@ -308,7 +308,6 @@ def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tu
         (short & (solved.accepted == 0), result_codes.NOT_FINITE),
         *((arrived & is_so, cause) for is_so, cause in of_drift),
     ]
-    # XLA would repeat a chain of `where` in each derivative that is NaN after a failure; a reduction it does
-    # not
+    # a reduction, because XLA would repeat a chain of `where` in each derivative that is NaN after a failure
     first = jax.lax.argmax(jnp.stack([*(is_so for is_so, _ in causes), jnp.array(True)]), 0, np.uint32)
     return jnp.append(np.array([cause for _, cause in causes], np.int32), code)[first]

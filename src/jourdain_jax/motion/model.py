@@ -80,9 +80,8 @@ class Model(BuiltFor, Printed):
             # outside `ensure_compile_time_eval`, which would evaluate the traces made here
             found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))
             with jax.ensure_compile_time_eval():
-                return jax.device_put(
-                    found
-                )  # a JAX array is passed to programs five times faster than NumPy's
+                # a JAX array is passed to programs five times faster than a NumPy array
+                return jax.device_put(found)
 
         return self.once(determined, sizes)
 

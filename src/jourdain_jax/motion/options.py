@@ -133,7 +133,7 @@ _register(Options)
 _register(AllOptions)
 _DEFAULT = AllOptions()
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
-GONE = {  # removed options -> replacements
+GONE = {  # replacements of removed options
     "adjoint": (
         f"all motions have derivatives in forward and in reverse mode; for a diffrax adjoint {_BY_DIFFRAX}"
     ),

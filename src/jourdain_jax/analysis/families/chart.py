@@ -29,9 +29,8 @@ class StabilityChart(Printed):
     values: Float[np.ndarray, "values"]  # of the first axis, equidistant
     # a mode, and one point for each value; a point that does not exist is NaN and has a code
     boundaries: tuple[tuple[str, CriticalPoint], ...]
-    bands: tuple[
-        Float[np.ndarray, "values"], ...
-    ]  # standard deviations of the second axis; NaN without a prior
+    # standard deviations of the second axis; NaN without a prior
+    bands: tuple[Float[np.ndarray, "values"], ...]
     middle: Family  # along the second axis, at the middle value of the first; shows which side is stable
 
     def _text(self) -> str:

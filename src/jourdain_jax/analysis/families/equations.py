@@ -8,7 +8,7 @@ units. Small motions about a steady motion:
 
     x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: basis of C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
 
-Match eigenvalues of small motions along a family, so that each column follows one mode.
+Eigenvalues of small motions are matched along a family, so that each column follows one mode.
 """
 
 from abc import ABC, abstractmethod

@@ -8,12 +8,11 @@ only the rates:
 
 For higher derivatives, tangents of these values are added (`integrate/loop/form.py`).
 
-Reverse mode of the loop in JAX, by the same code as machine code (`integrate/loop/adjoint.py`).
-
-The motion is integrated once more, and its trial steps are recorded in a window of limited length. At the
-end, the window contains the last steps. The steps of each earlier window are computed again, with equal bits,
-from the nearest checkpoint, which is a state stored at the beginning of a window. The number of checkpoints
-is also limited; at the limit, every second checkpoint is dropped.
+Reverse mode uses the same code as machine code (`integrate/loop/adjoint.py`). The motion is integrated once
+more, and its trial steps are recorded in a window of limited length. At the end, the window contains the last
+steps. The steps of each earlier window are computed again, with equal bits, from the nearest checkpoint,
+which is a state stored at the beginning of a window. The number of checkpoints is also limited; at the limit,
+every second checkpoint is dropped.
 """
 
 import math

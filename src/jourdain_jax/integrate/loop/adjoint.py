@@ -18,12 +18,10 @@ states times their cotangents g, and let g' be the change of g along the tangent
 where x is the initial state and the known numbers. Its change is d(dS)/dx, where dS is the sum of states
 times g' and of their tangents times g. So the cotangents are g' for the states and g for their tangents.
 
-Shift a state along its rates by a time, to give it derivatives with respect to times.
-
-Machine code integrates between constant times. The start is shifted along its rates from the differentiable
-time t_0 to a constant time, t_0 - d, and the results are shifted back to differentiable times. Let z be the
-state and all arguments of its rates, and G the rate of z. A shift of z by a time d, whose value is zero, has
-the derivative
+Derivatives with respect to times are added outside the loop. Machine code integrates between constant times.
+The start is shifted along its rates from the differentiable time t_0 to a constant time, t_0 - d, and the
+results are shifted back to differentiable times. Let z be the state and all arguments of its rates, and G the
+rate of z. A shift of z by a time d, whose value is zero, has the derivative
 
     dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to second order
 """

@@ -72,7 +72,7 @@ class Series:
         self.graph = graph
         self.of = {n: [n] for n in (*known, *states)} | {clock: [clock, graph.one]}
         self.state = [self.of[n] for n in states]
-        self._partial: dict[tuple[int, int], int] = {}  # (function, argument index) -> node of the derivative
+        self._partial: dict[tuple[int, int], int] = {}  # node of a derivative, by function and argument index
         needed = self._with_derivatives(graph.needed(rates, self.of), set(self.of))
         self.of |= {node: [] for node in needed}
         for k in range(order):

@@ -313,9 +313,7 @@ class Beside:
     """
 
     program: Lowered
-    needed: tuple[
-        Indices, ...
-    ]  # nodes of the parameters' entries on which fixed values depend; -1 for others
+    needed: tuple[Indices, ...]  # nodes of the parameters' entries that fixed values need, -1 for others
     fixed: Callable[[Array], Array]  # fixed values from these entries
     speeds: Callable[..., Array]  # all speeds, with derivatives
     numbers: Callable[..., Array]  # all speeds and pivots, without derivatives

@@ -35,9 +35,7 @@ class UsualLengths(eqx.Module):
 
     rows: UsualRows
     closures: Float[Array, "closures"]
-    own_speeds: Float[
-        Array, "own_speeds"
-    ]  # size of the coordinate rates due to each of the scene's own speeds
+    own_speeds: Float[Array, "own_speeds"]  # size of the coordinate rates due to each own speed of the scene
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:

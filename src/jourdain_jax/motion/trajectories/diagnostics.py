@@ -102,8 +102,7 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
     return Diagnostics(
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind + (", changed by work that was not integrated" if lacks_work else ""),
-        # plus a small share of the whole energy, so that no drift is reported if energies vary less, as at
-        # rest
+        # plus a small share of the whole energy: no drift is reported if energies vary less, as at rest
         energy_size=jnp.nanmax(energy.kinetic)
         + _span(energy.potential)
         + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),

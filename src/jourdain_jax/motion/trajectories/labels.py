@@ -16,7 +16,7 @@ from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.coordinates import Labels, check_names, parameters_of
 from jourdain_jax.scene.scene import state_names
 
-# name: field of a motion, type, missing value, attributes
+# by name: field of a motion, type, missing value, attributes
 OF_LANES: dict[str, tuple[str, str, float, dict]] = {
     "result": (
         "result",

@@ -88,8 +88,7 @@ class Record(eqx.Module):
     accepted: Count  # steps
     rejected: Count
     last_step: Scalar  # s, proposed by step-size control for the next step; NaN if unknown
-    # how often relations (`<`, `abs`, `floor`, ...) in loads, poses and constraints changed sign; -1: not
-    # monitored
+    # number of sign changes of relations (`<`, `abs`, ...) in loads, poses and constraints; -1: not monitored
     crossings: Count
     fallback: Count  # how the motion was retried, see `result_codes.FALLBACKS`; 0: not retried
     moved_q: Scalar  # change of the start by its projection
