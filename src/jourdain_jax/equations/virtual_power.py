@@ -311,7 +311,7 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
-    """Return all impressed forces, torques (body axes) and forces on the speeds. The latter include
+    """Return all impressed forces, torques (body axes) and forces on the speeds, which include
     `-N' dV/dq` of the scene's own potential. `loads`: as in `resultants`.
     """
     total = resultants(scene, motion, loads=loads)

@@ -64,7 +64,7 @@ class Call:
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
         """Return a call that computes the derivatives of each result. Their first axis runs over the entries
-        of the operands that move. Raises `Unsupported` if JAX has no forward derivative.
+        of the operands that vary. Raises `Unsupported` if JAX has no forward derivative.
         """
         function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
         places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]

@@ -101,7 +101,7 @@ class LookedAt:
 
     @property
     def graph(self) -> Graph:
-        """Return the graph."""
+        """Return the graph of the traced scene."""
         return self.traced.graph
 
 
