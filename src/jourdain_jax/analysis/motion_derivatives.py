@@ -60,7 +60,7 @@ class Places(NamedTuple):
 
 
 def places_of(scene: Scene) -> Places:
-    """Return the indices for a scene."""
+    """Return the indices of the parts of v and of the columns of D, for a scene."""
     n = len(scene.coordinate_names.entries)
     m = len(scene.speed_names.entries)
     geometric = len(names_of_position_rows(scene))
@@ -101,7 +101,7 @@ class Sloped:
         return differentiable(*self._parts)
 
     def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
-        """Return v, D and the matrix; NaN if a guard is not positive."""
+        """Return v, D and the matrix, if there is one. All are NaN if a guard is not positive."""
         xp = array_module(numbers)
         found = (self._traced if xp is jnp else self._known)(numbers)
         *values, guards = (found[which] for which in self._which)

@@ -325,8 +325,7 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
         # jump of the slope
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = largest(f) + largest(slope) + floor
-        # weight 1e-3: the jump at a kink is of order one, and its estimate is less accurate than the
-        # difference
+        # weight 1e-3: the jump at a kink is of order one, and its estimate is inaccurate
         error = np.maximum(np.abs(slope - central_difference(ends, h)), 1e-3 * np.abs(kink))
         values[f"{name}: its derivative"] = np.max(error, initial=0.0) / size
     return check("derivatives", values, q.dtype)

@@ -167,8 +167,7 @@ class Pivots:
         inverse = ((self.graph.div(self.graph.one, entry),),)
         return Pivot((row,), (column,), inverse, entry if monitored is None else monitored)
 
-    # quality at probes in the domain, and at probes with angles over full turns at which the system itself is
-    # regular
+    # quality at probes in the domain, and at far probes at which the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
         """Return whether an entry is far from zero wherever the system is regular, also beyond the domain."""

@@ -189,8 +189,7 @@ def numbers(times: int, y: Float[Array, "y *lanes"]) -> Int[Array, "times *ones"
 
 
 SLOTS = (
-    # maximum number of trial steps per window and of checkpoints; a memory limit may reduce both, to a
-    # sixteenth
+    # maximum number of trial steps per window and of checkpoints; at least 1/16 of it if memory is limited
     256
 )
 

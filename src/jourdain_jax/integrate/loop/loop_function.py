@@ -67,8 +67,7 @@ def flow(form: Form, method: Method, order: int | None) -> Loop:
     """
 
     def motion(form: Form) -> Loop:
-        # for second derivatives, the tableau replaces Taylor series of more than 36_000 products of
-        # coefficients
+        # for second derivatives, the tableau replaces Taylor series of more than 36_000 products
         too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
         return kernel(form, method, None if too_many else order)
 

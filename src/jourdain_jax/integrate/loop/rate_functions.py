@@ -215,8 +215,7 @@ def write_events(w: MachineWriter, form: Form) -> None:
                 w.store(x, dc, i)
 
 
-# limits on the operations of first and second derivatives, because reverse mode keeps some values on the
-# stack
+# limits on operations of first and second derivatives: reverse mode keeps some values on the stack
 LARGEST_DERIVATIVE = 10_000, 40_000
 
 

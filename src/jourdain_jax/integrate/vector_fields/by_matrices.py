@@ -190,8 +190,7 @@ class MinimalByMatrices(ByMatrices):
 class FullByMatrices(ByMatrices):
     """Full state: coordinates and all speeds."""
 
-    # pivot below which round-off decides between branches of motion that cross at a loss of rank; None: no
-    # branches
+    # pivot below which round-off decides between branches that cross at a loss of rank; None: no branches
     undecided: float | None = static()
     own_equations: str = static(default="")  # equations that a solver uses instead of accelerations
 
