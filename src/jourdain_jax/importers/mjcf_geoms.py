@@ -1,7 +1,7 @@
 """Geoms of MJCF files: their places, sizes, masses and shapes for drawing.
 
-Constant rotation matrices from angles, quaternions and axes; combined masses; volumes and moments of
-inertia of uniform solids. Sizes are those of MJCF: radii and half lengths.
+It also has constant rotation matrices from angles, quaternions and axes, combined masses, and volumes and
+moments of inertia of uniform solids. Sizes are those of MJCF: radii and half lengths.
 """
 
 import math

@@ -5,10 +5,9 @@ the correlation matrix, L z has that correlation. Phi(L z) replaces the probabil
 distribution maps this to a value. So any distributions can have correlated ranks; normal distributions have
 the stated correlation itself.
 
-Variation of a parameter or a start value over the samples of a study: distributions, and levels of a grid.
-
-A distribution maps uniform numbers u in (0, 1) to values by its inverse distribution function. A sampler that
-spreads u evenly (Latin hypercube, Sobol) therefore spreads the values well.
+Parameters and start values vary by distributions, or by levels of a grid. A distribution maps uniform numbers
+u in (0, 1) to values by its inverse distribution function. A sampler that spreads u evenly (Latin hypercube,
+Sobol) therefore spreads the values well.
 """
 
 import math

@@ -3,8 +3,8 @@
 Outputs are functions of a `Trajectory`, evaluated on all samples of a block by one compiled program. They are
 NaN for failed motions.
 
-The computation of a study: blocks of a fixed number of samples, each computed by one `rollout` and one
-compiled program for the outputs.
+A `Task` computes a study in blocks of a fixed number of samples, each by one `rollout` and one compiled
+program for the outputs.
 
 Block b of B samples holds samples b B to (b + 1) B - 1, independently of the chunks in which results are
 stored. The last block is padded with copies of its last sample. All blocks run the same compiled programs on

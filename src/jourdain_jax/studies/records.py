@@ -1,7 +1,7 @@
 """Records of a study on disk, with checksums: a receipt for each finished chunk, and the manifest with
 digests of all files that are written once.
 
-The lock of a study's folder.
+`locked` locks the folder of a study.
 """
 
 import contextlib

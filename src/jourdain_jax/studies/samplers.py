@@ -13,7 +13,7 @@
 Each sampler is a function of an ordered array of integers k, in NumPy or in JAX on a device. Both give
 identical bits, since they compute with words.
 
-Functions of doubles whose results have the same bits in NumPy on the host and in JAX on a device. Both run
+The functions of doubles have results with the same bits in NumPy on the host and in JAX on a device: both run
 the same source, with every operation rounded separately.
 
 Sums, quotients and roots are rounded identically everywhere. On some machines, however, compilers fuse a

@@ -14,10 +14,8 @@ Then, over the samples with both outputs,
 Histograms have a fixed grid of cells over twice the range of the first block, and count samples below and
 above this range. A quantile is known up to its cell; the smallest and largest values are exact.
 
-Sobol' indices: the share of an output's variance due to each varying quantity.
-
-With independent samples A_j, B_j, and AB_j^i equal to A_j except for quantity i, taken from B_j (Saltelli et
-al. 2010):
+Sobol' indices are the shares of an output's variance due to each varying quantity. With independent samples
+A_j, B_j, and AB_j^i equal to A_j except for quantity i, taken from B_j (Saltelli et al. 2010):
 
     S_i  = mean_j f(B_j) (f(AB_j^i) - f(A_j)) / V    first order: reduction of V if i is fixed (table 2, b)
     ST_i = mean_j (f(A_j) - f(AB_j^i))^2 / (2 V)     total: remainder if all others are fixed (2, f; Jansen)
@@ -157,7 +155,7 @@ class Tally:
             (place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0)
         )
         if not (shapes and numbers and within):
-            raise ValueError("the receipt of a chunk holds numbers that are out of their ranges")
+            raise ValueError("the receipt of a chunk has numbers out of range")
         return cls(**dict(arrays) | {"codes": np.pad(codes, (0, len(CODES) - codes.size))})
 
 

@@ -306,7 +306,7 @@ class Store:
             names = os.listdir(self.path / "run" / "chunks")
         except OSError as error:
             raise ValueError(
-                f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was "
+                f"`{self.path}` no longer contains the chunks of a study ({error.strerror}); it was "
                 "moved or removed"
             ) from None
         return sorted(

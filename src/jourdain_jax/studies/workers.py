@@ -4,8 +4,8 @@ runs must not be forked, and has its share of the cores.
 If a worker dies, a new worker computes its unfinished chunks, one at a time. A chunk on which workers died
 three times is omitted, with a warning that names its samples.
 
-Workers of a Dask cluster that compute the chunks of one study. All workers and the calling process must
-reach the study's folder.
+`on_cluster` computes the chunks by workers of a Dask cluster. All workers and the calling process must reach
+the study's folder.
 
 Dask restarts a chunk whose worker died. If workers die repeatedly on a chunk, it is tried once more alone,
 and then omitted with a warning.

@@ -1,7 +1,7 @@
 """Drawings of a motion: shapes of the bodies and their contacts at all saved times that were reached. A body
 without `visuals` is drawn with the shape that its constructor, outline, contacts or inertia suggest.
 
-Ground to draw: contact planes, meshes of curved surfaces, or a floor below the bodies.
+`grounds_of` returns the ground: contact planes, meshes of curved surfaces, or a floor below the bodies.
 """
 
 from dataclasses import dataclass

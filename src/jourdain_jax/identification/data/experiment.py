@@ -3,7 +3,7 @@ start, and sampled inputs.
 
     value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 
-Sensors and actuators of one run with numbers in place of estimates: `Reading` and `Drive`.
+`Reading` and `Drive` are the sensors and actuators of one run, with numbers in place of estimates.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

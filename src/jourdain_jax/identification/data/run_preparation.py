@@ -1,9 +1,9 @@
-"""Preparation of a measured run for a scene: its channels, sensors, actuators and inputs, checked.
+"""Preparation of a measured run for a scene: `checked` checks its channels, sensors, actuators and inputs.
 
-Warnings of measurements that are permitted, but probably wrong: inputs without samples over the whole run,
-gaps in a log, and angles that jump by a turn.
+`oddities` warns of measurements that are permitted, but probably wrong: inputs without samples over the whole
+run, gaps in a log, and angles that jump by a turn.
 
-Arguments that fits, likelihoods and plans share: options of their motions, and checked runs.
+`as_fit_options` and `as_runs` check arguments that fits, likelihoods and plans share.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

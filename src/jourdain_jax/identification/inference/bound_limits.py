@@ -19,8 +19,8 @@ would cover a true value 1.6 standard errors from its bound in only 92.5 % of re
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins,
 Physical Review D 57 (1998) 3873, section IV.
 
-The profile likelihood of one unknown: the minimum of F over all other unknowns, as a function of
-this one.
+`side` follows the profile likelihood of one unknown: the minimum of F over all other unknowns as a function
+of this one.
 """
 
 from collections.abc import Callable, Iterable

@@ -13,7 +13,7 @@ With one channel of unknown sigma, no prior and a linear motion, both equal the 
 regression. Source: F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; D. M. Bates and D. G. Watts,
 Nonlinear Regression Analysis (1988), section 6.1.
 
-Estimated sigmas, corrected for the unknowns that the same samples determine.
+Estimated sigmas are corrected for the unknowns that the same samples determine:
 
     sigma_c^2 = sum w^2 / (n_c - p_c),   p_c = tr(C A_c),   A_c = J_c' J_c / sigma_c^2
     degrees of freedom of C_ii   1 / sum_c v_ic^2 / (n_c - p_c),   v_ic = (C A_c C)_ii / C_ii

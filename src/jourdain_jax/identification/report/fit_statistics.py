@@ -5,7 +5,8 @@
 
 e: standard error; q: quantile (see `spread`); P: information of priors; C: covariance.
 
-Warnings of fitted motions: events before the last sample, missed observed events, and jumps of loads.
+`events_met` warns of fitted motions with events before the last sample, missed observed events, or jumps of
+loads.
 """
 
 from dataclasses import dataclass, replace

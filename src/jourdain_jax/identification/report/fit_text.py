@@ -1,6 +1,6 @@
 """The text that `print` shows of a fit, or of a batch of fits.
 
-Warnings of a fit: reasons not to rely on its estimates or intervals.
+`warnings_of` returns the warnings of a fit: reasons not to rely on its estimates or intervals.
 """
 
 from collections.abc import Iterator
@@ -208,8 +208,8 @@ def text(fit: Estimates) -> str:
             " + ..." if len(fit.shooting.pieces) > most else ""
         )
         lines.append(
-            f"found by multiple shooting in {pieces} pieces, which join to "
-            f"{float(fit.shooting.continuity):.1g} of the simulation's tolerance"
+            f"found by multiple shooting in {pieces} pieces with jumps of at most "
+            f"{float(fit.shooting.continuity):.1g} tolerances of the simulation"
         )
     if fit.guesses > 1:
         lines.append(fit.agreement)

@@ -10,9 +10,9 @@ if a distribution of mass can have it. I is linear in D; a flat body has a zero 
 If two axes share one parameter, their moments of inertia are equal, and so are their D. The parameters p_k
 are found by differentiating the inertia matrix.
 
-Ties: parameters that depend on others in a fit, such as two equal wheels.
+A `Tie` makes a parameter depend on others in a fit, such as those of two equal wheels:
 
-p = f(scene)      f: plain JAX, of the scene with the unknowns and all previously tied parameters
+    p = f(scene)      f: plain JAX, of the scene with the unknowns and all previously tied parameters
 
 A function is traced when it is passed. Ties are compared by their operations, so that a new lambda in
 every call is the same tie.

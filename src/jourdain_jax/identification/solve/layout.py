@@ -1,7 +1,7 @@
 """The layout of a vector of unknowns, and the scene, starts and sensors for such a vector.
 
 Shared unknowns are parameters of the scene, second moments and shears of bodies (`body_inertia`), and numbers
-of sensors. Other parameters may depend on them (`ties`).
+of sensors. Other parameters may depend on them (`Tie`).
 """
 
 import math

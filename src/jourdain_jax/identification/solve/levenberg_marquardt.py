@@ -17,7 +17,7 @@ Several problems of one shape (`members`) run as a batch; finished members are n
 Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near
 the minimum slopes instead of values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 
-Losses of a fit: rho(r) grows like r^2 for small residuals r, and more slowly for outliers.
+A `Loss` rho(r) grows like r^2 for small residuals r, and more slowly for outliers:
 
     minimise sum rho(r)
     weights     w = rho'(r) / r     least squares of sqrt(w) r and sqrt(w) J has the same gradient

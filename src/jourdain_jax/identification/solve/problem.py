@@ -3,7 +3,7 @@
     F = sum rho(w) + sum n log sigma + |M (theta - mean) / s|^2 / 2
 
 w: whitened residuals (see `correlated_noise`); sigma^2: mean w^2 of the n samples of each channel of unknown
-sigma; mean, s: of priors; M: see `joint_prior`; rho: see `loss`.
+sigma; mean, s: of priors; M: see `joint_normal`; rho: see `Loss`.
 """
 
 import math

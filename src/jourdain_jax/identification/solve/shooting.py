@@ -16,9 +16,8 @@ Nodes are the states s = (q, u, y) between pieces: coordinates, speeds, and filt
 A piece begins at the projection of its node onto the constraints, and continuity is required of all entries
 of s. No chart of the constraint manifold is needed, which could be singular.
 
-One run prepared for a fit: weighted measurements, the motion, and residuals.
-
-r = (reading - value) / sigma, zero where a sample is missing
+`Run` is a run or a piece, prepared for a fit, with residuals r = (reading - value) / sigma, zero where a
+sample is missing.
 """
 
 import math

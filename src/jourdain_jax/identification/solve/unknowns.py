@@ -134,8 +134,8 @@ def unknowns_of(
 ) -> Unknowns:
     """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
 
-    If `free` has a function of the scene for a parameter, this parameter depends on the unknowns (`ties`).
-    The unknowns of a single run count as shared unless `apart`.
+    If `free` has a function of the scene for a parameter, this parameter depends on the unknowns (`Tie`). The
+    unknowns of a single run count as shared unless `apart`.
 
     Raises ValueError for unknown names, guesses outside their bounds, parameters with `per_run`, different
     estimates of one shared number, and a fit without unknowns.
