@@ -35,10 +35,10 @@ from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.explicit_steps import method_of
 from jourdain_jax.integrate.loop import native_motion, step
-from jourdain_jax.integrate.loop.handover import Start
+from jourdain_jax.integrate.loop.loop_function import Start
 from jourdain_jax.integrate.setup import Solved
 from jourdain_jax.integrate.vector_fields.field import Integrated
-from jourdain_jax.lowering import appell, kept_rows, lower, partial_velocities
+from jourdain_jax.lowering import appell, lower, multipliers, partial_velocities
 from jourdain_jax.models import MODELS
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
@@ -445,7 +445,7 @@ MUTANTS = [
     ),
     Mutant(
         "multipliers without drift",
-        kept_rows,
+        multipliers,
         "accelerations_by_multipliers",
         "graph.add(d, graph.dot(row, free))",
         "graph.dot(row, free)",
@@ -454,7 +454,7 @@ MUTANTS = [
     ),
     Mutant(
         "sign of multipliers",
-        kept_rows,
+        multipliers,
         "accelerations_by_multipliers",
         "graph.add(w, graph.dot(",
         "graph.sub(w, graph.dot(",
@@ -472,7 +472,7 @@ MUTANTS = [
     ),
     Mutant(
         "nearest without masses",
-        kept_rows,
+        multipliers,
         "projected_speeds",
         "impulses = solve_symmetric(graph, M, A).solution",
         "impulses = A",
@@ -481,7 +481,7 @@ MUTANTS = [
     ),
     Mutant(
         "no least angle between rows",
-        kept_rows,
+        multipliers,
         "accelerations_by_multipliers",
         "graph.mul(least,",
         "graph.mul(graph.const(-1.0),",

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
+from jourdain_jax.equations.gibbs_appell import accelerations_of, minimal_kinematics
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.program.calls import interpret_with_calls
 from jourdain_jax.program.evaluate import Probes

@@ -12,7 +12,7 @@ import jourdain_jax as jj
 from jourdain_jax.bicycle import linear_matrices
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations import position_residual, velocity_residual
-from jourdain_jax.equations.minimal import minimal_kinematics
+from jourdain_jax.equations.gibbs_appell import minimal_kinematics
 from jourdain_jax.equations.projection import project_positions
 from jourdain_jax.models import WhippleBicycle
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import minimal_kinematics
+from jourdain_jax.equations.gibbs_appell import minimal_kinematics
 
 
 @dataclass(frozen=True)

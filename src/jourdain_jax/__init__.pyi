@@ -11,8 +11,7 @@ from .analysis.report import report
 from .analysis.steady import steady
 from .analysis.verify import verify
 from .calculus.derivative_errors import DifferentiationModeError
-from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
-from .calculus.vectors import vec
+from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z, vec
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from .dynamics.reactions import newton_residual
 from .equations.kinematics import motion_at, pose_at

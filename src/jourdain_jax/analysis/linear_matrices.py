@@ -1,22 +1,204 @@
 """Compute the matrices of small motions: A, B of the first-order form; M, C, K, F of the second-order form
 (`linearize.py`).
+
+Perturbations of a state on the constraint manifold, and the choice of independent ones.
+
+    dq = E ds,   dg = G ds = 0,   dphi = Phi_s ds + A du + Phi_f df = 0
+
+For a plain coordinate, `ds` equals `dq`. A quaternion is perturbed by a small rotation in body axes, `dq = q
+(0, ds)/2`, so that no component is special. The geometric constraints g determine the dependent `ds`; the
+velocity constraints phi determine the dependent `du`.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.motion_derivatives import places_of
-from jourdain_jax.analysis.tangent import (
-    eliminated,
-    inverse,
-    others,
-    perturbations,
-    perturbed_names,
-    smallest_pivot,
+from jourdain_jax.calculus.reals import (
+    Entries,
+    Indices,
+    all_finite,
+    array_module,
+    largest,
+    rank_cutoff,
+    tiny_of,
 )
-from jourdain_jax.calculus.reals import Indices, array_module, largest
-from jourdain_jax.scene.coordinates import Labels
+from jourdain_jax.equations.reductions import scaled
+from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.coordinates import Labels, check_names
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.rank import best_privileged, named_speeds, pivots_at
+from jourdain_jax.structure.structure import WELL_CONDITIONED, structure_of, usual_rows
+
+
+def perturbed_names(scene: Scene) -> Labels:
+    """Return the names of the perturbations `ds`: the plain coordinates, and for each quaternion three
+    rotations in body axes, such as `attitude_turn_x`, `..._y`, `..._z`.
+    """
+    names = list(scene.coordinate_names.entries)
+    for first, _ in reversed(scene.coordinates.quaternions):
+        group = names[first].removesuffix("_w")
+        names[first : first + 4] = [f"{group}_turn_{axis}" for axis in "xyz"]
+    return tuple(names)
+
+
+def perturbations(
+    scene: Scene,
+) -> tuple[
+    Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]
+]:
+    """Return S and B of `dq = E ds` with `E = S + B q`. For plain coordinates E is the identity; for a
+    quaternion `E ds` is half its product with the small rotation ds.
+
+    For a unit quaternion the inverse of `x -> q x` is its transpose: `ds = (S + 4 B q)' dq`.
+    """
+    names, entries = perturbed_names(scene), scene.coordinate_names.entries
+    S = np.array([[float(entry == name) for name in names] for entry in entries])
+    B = np.zeros((*S.shape, len(entries)))
+    for k, (first, _) in enumerate(scene.coordinates.quaternions):
+        own = slice(first, first + 4)
+        B[own, first - k : first - k + 3, own] = _HALF_A_TURN
+    return S, B
+
+
+# q (0, ds)/2 = H q ds, by components w, x, y, z of the product and by axes of the rotation
+_HALF_A_TURN = (
+    np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]]
+    * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None]
+    / 2
+)
+
+
+def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
+    """Return the inverse of a square matrix, or the pseudo-inverse of a rectangular one; NaN if there is
+    none.
+    """
+    try:
+        return (
+            array_module(x).linalg.inv(x)
+            if len(x) == x.shape[1]
+            else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
+        )
+    except np.linalg.LinAlgError:
+        return np.full(x.T.shape, np.nan)
+
+
+def others(some, count: int) -> Int[np.ndarray, "rest"]:
+    """Return the indices below `count` that are not in `some`."""
+    return np.setdiff1d(np.arange(count), np.asarray(some, int))
+
+
+def eliminated(
+    rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]
+) -> Float[Entries, "all independent"]:
+    """Return the matrix that maps independent perturbations to all perturbations with `rows @ perturbation =
+    0`.
+    """
+    dependent = others(independent, rows.shape[1])
+    rows = _of_unit_length(rows, dependent)
+    followed = -inverse(rows[:, dependent]) @ rows[:, independent]
+    return array_module(rows).concatenate([np.eye(len(independent)), followed])[
+        np.argsort(np.concatenate([independent, dependent]))
+    ]
+
+
+def smallest_pivot(
+    rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
+) -> Float[Entries, ""]:
+    """Return the smallest singular value of the dependent columns, scaled to rows of unit length. It is
+    treated as constant in differentiation.
+    """
+    xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
+    if xp is np and not all_finite(block):
+        return np.asarray(np.nan)
+    sizes = xp.linalg.svd(jax.lax.stop_gradient(block) if xp is jnp else block, compute_uv=False)
+    return xp.asarray(xp.min(sizes, initial=1.0) if len(block) >= len(dependent) else 0.0)
+
+
+def _of_unit_length(
+    rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]
+) -> Float[Entries, "rows all"]:
+    """Return the rows, each divided by the length of its dependent part."""
+    xp, block = array_module(rows), rows[:, dependent]
+    length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
+    return rows / xp.where(length > 0, length, 1.0)
+
+
+def privileged_speeds(scene: Scene, names: str | Labels | None = None) -> Indices:
+    """Return the indices of the independent speeds: the named ones if given, otherwise those of the scene's
+    structure.
+    """
+    known = structure_of(scene)
+    return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
+
+
+def privileged_at(scene: Scene, state: State, f, usual: Indices) -> Indices:
+    """Return the indices of independent speeds at a known state: the `usual` ones, or others if the usual
+    ones do not determine the dependent speeds well.
+    """
+    A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
+    rank = count - len(usual)
+    pivot = pivots_at(A, others(usual, count).tolist(), rank)[0]
+    return usual if pivot >= WELL_CONDITIONED else best_privileged(A, count, rank)
+
+
+@eval_numpy
+def _scaled_rows(scene: Scene, t, q, u, f):
+    equations, rows = equations_and_rows(scene, t, q, u, f)
+    return scaled(equations, rows.judged_by(usual_rows(scene))).A
+
+
+def dependent_coordinates(
+    scene: Scene,
+    state: State,
+    named: Labels,
+    dependent: Labels | None,
+    G: Float[np.ndarray, "rows coordinates"] | None = None,
+) -> Int[np.ndarray, "dependent"]:
+    """Return the indices of the dependent perturbations `ds`, which the geometric constraints determine:
+    those in `dependent` if given, otherwise a well-conditioned choice.
+
+    `G`: dg/dq at the state. If it is unknown, states of the scene's domain are used instead.
+    """
+    names = perturbed_names(scene)
+    check_names(
+        (*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to perturb"
+    )
+    if len(set(named)) != len(named):
+        raise ValueError(f"`coordinates` contains a name twice ({', '.join(named)}); give each once")
+    both = set(named) & set(dependent or ())
+    if both:
+        raise ValueError(
+            f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it from one of them"
+        )
+    if dependent is not None:
+        return np.array([names.index(name) for name in dependent], int)
+    if not names_of_position_rows(scene):
+        return np.zeros(0, int)
+    known, count = structure_of(scene), len(names_of_position_rows(scene))
+    G, q = (
+        (known.closure_slopes[:, :count], known.coordinates)
+        if G is None
+        else (G[None], np.asarray(state.q)[None])
+    )
+    S, B = perturbations(scene)
+    G = G @ np.stack([S + B @ x for x in q[: len(G)]])
+    G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), tiny_of(G))
+    cutoff = rank_cutoff(G.dtype)
+    rank = max(int(np.linalg.matrix_rank(block, tol=cutoff)) for block in G)
+    free = others([names.index(name) for name in named], len(names))
+    chosen = np.delete(free, best_privileged(G[:, :, free], len(free), rank)) if len(free) >= rank else free
+    if len(chosen) < rank or np.any(pivots_at(G, chosen.tolist(), rank) <= cutoff):
+        raise ValueError(
+            f"the geometric constraints of `{type(scene).__name__}` make the given coordinates dependent; "
+            "give fewer in `coordinates`, or name the `dependent` ones"
+        )
+    return chosen
 
 
 def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, coordinates: Labels) -> dict:

@@ -4,10 +4,10 @@
     named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f
                                                                    M = W' (mass matrix) W
 
-Dependent coordinates and speeds follow from the linearised constraints (`tangent.py`). The second-order form
-is Appell's equations for the named coordinates: the first-order form, written with the speeds (pdot, other
-independent speeds) and multiplied by M. Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson,
-G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
+Dependent coordinates and speeds follow from the linearised constraints (`linear_matrices.py`). The
+second-order form is Appell's equations for the named coordinates: the first-order form, written with the
+speeds (pdot, other independent speeds) and multiplied by M. Source: Wang and Pao (2003), eqs. (25)-(31),
+(41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
 import equinox as eqx
@@ -18,16 +18,17 @@ from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.eigenvalue_derivatives import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.equations import mode_names
-from jourdain_jax.analysis.linear_matrices import matrices_of, own_rate
-from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
-from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
-from jourdain_jax.analysis.tangent import (
+from jourdain_jax.analysis.linear_matrices import (
     dependent_coordinates,
+    matrices_of,
+    own_rate,
     perturbations,
     perturbed_names,
     privileged_at,
     privileged_speeds,
 )
+from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
+from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, holds, is_traced, static
 from jourdain_jax.equations.kinematics import motion_at

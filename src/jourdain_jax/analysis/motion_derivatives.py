@@ -24,7 +24,7 @@ from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import Privileged, scaled
-from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.integrate.loop.value_kernels import nodes_called, values_of_nodes
 from jourdain_jax.kernels import ffi

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.families.equations import sizes
+from jourdain_jax.analysis.linear_matrices import privileged_speeds
 from jourdain_jax.analysis.motion_derivatives import (
     ByMatrices,
     ByProgram,
@@ -27,7 +28,6 @@ from jourdain_jax.analysis.motion_derivatives import (
     places_of,
     unseen,
 )
-from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
     Flag,

@@ -41,7 +41,7 @@ from jourdain_jax.equations.kinematics import (
     velocities,
 )
 from jourdain_jax.equations.reductions import row_scale, speed_scale
-from jourdain_jax.equations.scene_parts import names_of_rows
+from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.virtual_power import (
     energies_at,
     equations_and_rows,

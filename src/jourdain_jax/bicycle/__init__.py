@@ -10,13 +10,16 @@ from jourdain_jax.bicycle.parameter_files import (
     shipped_measurements,
 )
 from jourdain_jax.bicycle.stability import (
+    Interval,
+    ParameterSamples,
     StabilitySpeeds,
     eigenvalues,
+    interval,
     linear_matrices,
+    sample_parameters,
     stability_speeds,
     upright_running,
 )
-from jourdain_jax.bicycle.uncertainty import Interval, ParameterSamples, interval, sample_parameters
 
 __all__ = [
     "Interval",

@@ -19,8 +19,14 @@ from jourdain_jax.bicycle.measurements import benchmark_from_measurements
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
-from jourdain_jax.bicycle.stability import eigenvalues, linear_matrices, stability_speeds, upright_running
-from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
+from jourdain_jax.bicycle.stability import (
+    eigenvalues,
+    interval,
+    linear_matrices,
+    sample_parameters,
+    stability_speeds,
+    upright_running,
+)
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.integrate.result_codes import EVENT
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle

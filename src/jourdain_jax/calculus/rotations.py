@@ -7,6 +7,8 @@ Quaternions are `(w, x, y, z)`.
 Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, positive angles
 act as follows: `rot_z` turns to the left, `rot_x` leans to the right, `rot_y` pitches the nose down and rolls
 a wheel ahead.
+
+Vectors of three numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -155,3 +157,12 @@ def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
     half = _angle(angle) / 2
     axis = checked_real(axis, "axis of a quaternion", (3,), advice="pass a unit vector")
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+
+
+def vec(x: Number, y: Number, z: Number) -> Float[Array, "*times 3"]:
+    """Return the vector (x, y, z) of three numbers, also traced ones: `jj.vec(q.x, q.y, 0)`.
+
+    Arrays of equal shape, such as values along a motion, give a vector for each entry.
+    """
+    dtype = jnp.result_type(float, x, y, z)
+    return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(part, dtype) for part in (x, y, z))), axis=-1)

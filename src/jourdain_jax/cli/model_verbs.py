@@ -8,7 +8,7 @@ import numpy as np
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
 from jourdain_jax.calculus.files import check_place, number
-from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.equations.rows import names_of_events
 from jourdain_jax.integrate.result_codes import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate

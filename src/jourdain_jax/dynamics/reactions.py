@@ -43,8 +43,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, largest, rank_cutoff, static
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.dynamics.accelerations import Accelerations
-from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
+from jourdain_jax.dynamics.accelerations import Accelerations, Wrenches, normal_forces
 from jourdain_jax.equations.kinematics import (
     Velocities,
     bias_accelerations,
@@ -56,8 +55,7 @@ from jourdain_jax.equations.kinematics import (
     velocities_of,
 )
 from jourdain_jax.equations.reductions import Reduced
-from jourdain_jax.equations.rows import flatten_rows, velocity_rows
-from jourdain_jax.equations.scene_parts import has_load_without_potential, names_of_rows
+from jourdain_jax.equations.rows import flatten_rows, has_load_without_potential, names_of_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import (
     Resultants,
     contact_response,

@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.dynamics.reactions import potential_resultants
+from jourdain_jax.equations.gibbs_appell import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.kinematics import coordinate_rates, of_bodies
-from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.coordinates import Labels

@@ -1,6 +1,6 @@
 """Jourdain's principle of virtual power: kinematics, virtual power, constraints, reduction, accelerations.
 
-    kinematics.py -> virtual_power.py -> rows.py -> reductions.py -> gibbs_appell.py, minimal.py
+    kinematics.py -> virtual_power.py -> rows.py -> reductions.py -> gibbs_appell.py
 
 The code of every formula of docs/theory.md is here or in `dynamics`, beside the formula. Contacts that
 switch: `contact_laws.py`, `phases.py`. Open `kinematics.py` first.

@@ -22,8 +22,7 @@ from jourdain_jax.equations.kinematics import (
     motion_at,
     velocities_of,
 )
-from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, velocity_rows
-from jourdain_jax.equations.scene_parts import names_of_rows
+from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion

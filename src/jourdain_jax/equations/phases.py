@@ -53,15 +53,15 @@ from jourdain_jax.equations.contact_laws import (
     solved,
     unit,
 )
-from jourdain_jax.equations.contact_rows import gaps_of, switching_rows
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.rows import gaps_of, switching_rows
 from jourdain_jax.equations.virtual_power import (
     ContactResponse,
     contact_modes,
     contact_response,
     switching_forces,
 )
-from jourdain_jax.scene.contact.friction_contacts import (
+from jourdain_jax.scene.modes import (
     CREEPS,
     FLAT,
     FLIES,
@@ -70,8 +70,8 @@ from jourdain_jax.scene.contact.friction_contacts import (
     ROLLS,
     SLIPS,
     UNDECIDED,
+    Event,
 )
-from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 

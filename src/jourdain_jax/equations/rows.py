@@ -5,9 +5,18 @@
 Geometric constraints `g(t, q) = 0` enter as `phi = dg/dt`, and keep their position residual `g`. Order:
 prescribed coordinates, geometric constraints and contact heights, which have a position residual; then
 no-slip and velocity constraints. Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
+
+Kinematics of switching contacts, and of constraints that hold until their force exceeds a limit: gaps,
+speeds, and derivatives.
+
+    w = (dg/dt, slip along the tangents)    of each contact with gap g
+    w = A u + a,   dw/dt = A udot + drift
+
+Names of the parts of a scene, found by tracing it once, without evaluation at a state.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,14 +25,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import Scalar
-from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
-from jourdain_jax.scene.contact.contacts import Contact
+from jourdain_jax.scene.contact.contacts import Contact, Coulomb
+from jourdain_jax.scene.identity import once_per_class
+from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import (
     contacts_of,
+    events_of,
     geometric_constraints_of,
+    held_rows_of,
+    invariants_of,
+    loads_of,
     prescribed_of,
     velocity_constraints_of,
 )
@@ -158,3 +173,163 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 @eqx.filter_jit
 def _velocity_residual(scene: Scene, t: Scalar, q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
+
+
+class ContactRows(eqx.Module):
+    """Gaps and speeds of all switching contacts at one state, with derivatives; three rows per contact."""
+
+    gap: Float[Array, "contacts"]
+    w: Float[Array, "rows"]
+    A: Float[Array, "rows speeds"]
+    drift: Float[Array, "rows"]
+
+
+class SwitchingRow(NamedTuple):
+    """A contact with friction, or a constraint that holds until its force exceeds a limit."""
+
+    friction: Coulomb
+    slip: Float[Array, "2"]  # m/s or rad/s
+    contact: Contact | None  # None: a constraint, with unit normal force
+
+    @property
+    def restitution(self) -> Scalar:
+        """Return Newton's coefficient of restitution; zero for constraints."""
+        return jnp.zeros_like(self.slip[0]) if self.contact is None else jnp.asarray(self.contact.restitution)
+
+    @property
+    def impact(self) -> str:
+        """Return the law of impacts."""
+        return "moreau" if self.contact is None else self.contact.impact
+
+    def lean(self) -> Scalar | None:
+        """Return the lean of a disc or wheel (`Contact.lean`)."""
+        return None if self.contact is None else self.contact.lean()
+
+
+def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
+    """Return the contacts with friction and the constraints with a force limit, in the order of
+    their modes.
+    """
+    contacts = contacts_of(scene, motion.pose())
+    found = {
+        name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction
+    }
+    rows = held_rows_of(scene, motion).items()
+    found |= {name: SwitchingRow(row.friction, row.slip, None) for name, row in rows}
+    return {name: found[name] for name in scene.switching.contacts}
+
+
+def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
+    """Return the gaps of switching contacts, in m; zero for constraints."""
+    contacts = contacts_of(scene, pose)
+    names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
+    return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
+
+
+def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
+    """Return the rates of the gaps, and the slip along both tangents, of all switching contacts, in m/s."""
+    rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
+    slips = [row.slip for row in switching_rows(scene, motion).values()]
+    return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
+
+
+def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
+    """Return gaps, speeds, A and drift of the switching contacts at the state of a motion."""
+    t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
+
+    def speeds(t, q, u):
+        return contact_speeds(scene, motion_at(scene, t, q, u, inputs))
+
+    gap = gaps_of(scene, motion.pose())
+    A = jax.jacfwd(lambda u: speeds(t, q, u))(u)
+    w, drift = jax.jvp(
+        lambda t, q: speeds(t, q, u), (t, q), (jnp.ones_like(t), coordinate_rates(scene, t, q, u))
+    )
+    return ContactRows(gap, w, A, drift)
+
+
+def contact_loads(
+    scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
+) -> tuple[Load, ...]:
+    """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a force
+    limit give the forces A' L on the speeds.
+    """
+    loads, along, speeds = [], A[1::3], scene.speed_names.entries
+    for i, (row, (normal, *tangential)) in enumerate(
+        zip(switching_rows(scene, motion).values(), forces.reshape(-1, 3), strict=True)
+    ):
+        if (contact := row.contact) is None:
+            loads.append(Load(generalized=dict(zip(speeds, along[i] * tangential[0], strict=True))))
+            continue
+        force = normal * contact.plane.normal + jnp.stack(tangential) @ contact.plane.tangents
+        torque = jnp.cross(contact.point - motion[contact.body].position, force)
+        loads.append(Load(forces={contact.body: force}, torques={contact.body: torque}))
+    return tuple(loads)
+
+
+class _Listed(NamedTuple):
+    bodies: tuple[str, ...]
+    rows: tuple[str, ...]
+    position_rows: tuple[str, ...]
+    events: tuple[str, ...]
+    stops: tuple[bool, ...]  # whether each event stops the motion
+    has_load_without_potential: bool
+
+
+def names_of_bodies(scene: Scene) -> tuple[str, ...]:
+    """Return names of the bodies, sorted."""
+    return _listed(scene).bodies
+
+
+def names_of_rows(scene: Scene) -> tuple[str, ...]:
+    """Return names of all constraint rows, in order."""
+    return _listed(scene).rows
+
+
+def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
+    """Return names of the geometric constraint rows, in order; they come first."""
+    return _listed(scene).position_rows
+
+
+def names_of_events(scene: Scene) -> tuple[str, ...]:
+    """Return names of the events, sorted."""
+    return _listed(scene).events
+
+
+def stops(scene: Scene) -> tuple[bool, ...]:
+    """Return whether each event stops the motion, in the order of their names."""
+    return _listed(scene).stops
+
+
+def has_load_without_potential(scene: Scene) -> bool:
+    """Return whether some load has no potential."""
+    return _listed(scene).has_load_without_potential
+
+
+@once_per_class
+def names_of_invariants(scene: Scene) -> tuple[str, ...]:
+    """Return the sorted names of the scene's invariants. Motions do not call this, so errors in `invariants`
+    appear only when invariants are used.
+    """
+    return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
+
+
+@once_per_class
+def _listed(scene: Scene) -> _Listed:
+    """Return the names. They are recorded during the trace, because JAX returns only arrays and sorts
+    dictionaries by name.
+    """
+    noted: list[_Listed] = []
+
+    def look(scene: Scene, motion: Motion) -> None:
+        rows = row_names(velocity_rows(scene, motion))
+        first = row_names(position_rows(scene, motion.pose()))
+        without = any(load.potential is None for load in loads_of(scene, motion))
+        without = without or bool(scene.switching.contacts)
+        stop = {name: event.stop for name, event in events_of(scene, motion).items()}
+        stop |= dict.fromkeys(scene.switching.events, False)
+        events, ends = zip(*sorted(stop.items()), strict=True) if stop else ((), ())
+        noted.append(_Listed(tuple(motion.bodies), rows, first, events, ends, without))
+
+    shapes_along_motion(look, scene)
+    return noted[0]

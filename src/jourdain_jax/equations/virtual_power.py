@@ -27,7 +27,6 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, check_kind
 from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
-from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_rows
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
     Inertias,
@@ -41,12 +40,18 @@ from jourdain_jax.equations.kinematics import (
     pose_at,
     velocities_of,
 )
-from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.equations.rows import (
+    ConstraintRows,
+    ContactRows,
+    contact_loads,
+    contact_rows,
+    switching_rows,
+)
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
-from jourdain_jax.scene.contact.friction_contacts import FLIES, ROLLS, SLIPS
 from jourdain_jax.scene.coordinates import check_name
 from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.modes import FLIES, ROLLS, SLIPS
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import loads_of, potential_of

@@ -11,8 +11,7 @@ A motion enters only through `solve/shooting.py`. Open `fit.py` first.
 from jourdain_jax.identification.data.channels import Accelerometer, LoadCell
 from jourdain_jax.identification.data.estimate import joint_normal, unbounded
 from jourdain_jax.identification.data.sensors import Actuator, Sensor
-from jourdain_jax.identification.inference.filtering import filtered_log_likelihood
-from jourdain_jax.identification.inference.likelihood import log_likelihood
+from jourdain_jax.identification.inference.likelihood import filtered_log_likelihood, log_likelihood
 from jourdain_jax.identification.inference.log_density import LogDensity, log_density
 from jourdain_jax.identification.inference.planned_information import PlannedInformation, planned_information
 from jourdain_jax.identification.report.fit_result import Fit

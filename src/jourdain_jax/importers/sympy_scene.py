@@ -12,8 +12,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import Scalar, check_kind, checked_real, largest, real_type
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.scene_class import identifiers, scene_class
-from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
-from jourdain_jax.importers.sympy_samples import affine, sampled, symbols_in
+from jourdain_jax.importers.sympy_kinematics import Pose, affine, poses_of, sampled, symbols_in
 from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_system
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import check_names, coordinates, inputs, parameter, speeds

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import differentiated_as, with_derivatives_of
 from jourdain_jax.calculus.reals import Entries, Speeds, rank_cutoff, real_type, static
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
-from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.integrate.loop import projection_kernel
 from jourdain_jax.integrate.loop.projection_kernel import Rows, write
 from jourdain_jax.integrate.loop.value_kernels import called, entries, values_of_nodes

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.dynamics.reactions import needs_work
-from jourdain_jax.equations.scene_parts import names_of_position_rows
+from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField

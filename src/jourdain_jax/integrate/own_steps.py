@@ -24,8 +24,7 @@ from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMetho
 from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
 from jourdain_jax.integrate.loop import native_motion
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.handover import Start
-from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, flow
+from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Start, flow
 from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import driven, may_jump

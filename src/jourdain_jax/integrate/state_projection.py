@@ -19,7 +19,7 @@ from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, real_type, static
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.reductions import row_scale
-from jourdain_jax.equations.scene_parts import names_of_position_rows
+from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.integrate.constraint_projection import (
     Usual,
     functions_of_rows,

@@ -6,19 +6,21 @@
     f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M ydot = f                                                                             (41), (50), (56)
 
-Constraints that are not eliminated are kept (`kept_rows.py`). `partial_velocities.py` computes beta, gamma,
+Constraints that are not eliminated are kept (`multipliers.py`). `partial_velocities.py` computes beta, gamma,
 a_0 and alpha_0 by one of two strategies.
+
+Simplify switching contacts by normal forms. Their responses are simplified once; loads, events, resets and
+starts then use the simplified nodes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
 
-from jourdain_jax.lowering.contact_forms import simplify_contacts
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
-from jourdain_jax.lowering.kept_rows import KeptRows
-from jourdain_jax.lowering.multipliers import Accelerations, projected_coordinates
+from jourdain_jax.lowering.multipliers import Accelerations, KeptRows, projected_coordinates
 from jourdain_jax.lowering.partial_velocities import Kinematics
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.evaluate import Probes
@@ -28,6 +30,25 @@ from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 from jourdain_jax.structure.probes import generic_states
 from jourdain_jax.structure.structure import Structure
 from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
+
+MOST_TERMS = (8, 60)  # term limits to try
+
+
+def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
+    """Replace `responses` by normal forms. Responses at later states, which are functions of earlier
+    responses, are replaced, too. `forms`: function from a maximum number of terms to normal forms.
+    """
+    g, at = traced.graph, traced.at
+    state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]
+    first, *later = (row[len(state) :] for row in at.responses.tolist())
+    normal = min([first, *(forms(most).all_simplified(first) for most in MOST_TERMS)], key=g.operations)
+    simple = dict(zip(first, normal, strict=True))
+    for row, nodes in zip(at.responses[1:, : len(state)].tolist(), later, strict=True):
+        now = dict(zip(state, g.substituted(row, simple), strict=True))
+        simple |= dict(zip(nodes, g.substituted(normal, now), strict=True))
+    loads = at.force, at.torque, at.direct, at.power
+    for x in (*loads, at.events, at.resets, at.slip_turns, at.held, at.start):
+        x[...] = np.array(g.substituted(x.ravel().tolist(), simple), np.int64).reshape(x.shape)
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,21 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import Indices, is_traced
-from jourdain_jax.equations.scene_parts import names_of_events, stops
+from jourdain_jax.equations.rows import names_of_events, stops
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import (
     agree,
     check_against_dense,
     comparison_probes,
+    full_turns,
+    on_velocity_rows,
     rates_of,
     values_at,
 )
-from jourdain_jax.lowering.distant_probes import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
-from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered, Stage
+from jourdain_jax.lowering.multipliers import KeptRows
 from jourdain_jax.lowering.relations import jumps, relations, sided
 from jourdain_jax.program.evaluate import Probes, part_of
 from jourdain_jax.program.graph import Graph, NodeList, Unsupported

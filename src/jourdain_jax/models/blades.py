@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
-from jourdain_jax.calculus.rotations import rot_y, rot_z
-from jourdain_jax.calculus.vectors import vec
+from jourdain_jax.calculus.rotations import rot_y, rot_z, vec
 from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.coordinates import coordinates, inputs, parameter, speeds
 from jourdain_jax.scene.loads import generalized_force, gravity, knife_edge, pin

@@ -5,8 +5,7 @@ import math
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Parameter
-from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
-from jourdain_jax.calculus.vectors import vec
+from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z, vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact.contacts import disc_contact

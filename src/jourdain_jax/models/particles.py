@@ -5,7 +5,7 @@ velocities.
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Parameter
-from jourdain_jax.calculus.vectors import vec
+from jourdain_jax.calculus.rotations import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle, Visual
 from jourdain_jax.scene.contact.grounds import tangents_of

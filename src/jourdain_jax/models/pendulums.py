@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
-from jourdain_jax.calculus.vectors import vec
+from jourdain_jax.calculus.rotations import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle, Visual
 from jourdain_jax.scene.coordinates import coordinates, parameter

@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import Matrix3, Parameter, Scalar, Vector3, real_type
-from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
-from jourdain_jax.calculus.vectors import vec
+from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z, vec
 from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.contact.contacts import disc_contact
 from jourdain_jax.scene.coordinates import Labels, check_name, coordinates, inputs, parameter, parameters_of

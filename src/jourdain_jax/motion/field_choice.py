@@ -6,7 +6,7 @@ from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.reactions import needs_work
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
-from jourdain_jax.equations.scene_parts import names_of_events, names_of_position_rows, stops
+from jourdain_jax.equations.rows import names_of_events, names_of_position_rows, stops
 from jourdain_jax.integrate.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
 from jourdain_jax.integrate.vector_fields.field import (
     ByProgram,

@@ -10,7 +10,7 @@ import jax
 
 from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.dynamics.reactions import needs_work
-from jourdain_jax.equations.scene_parts import names_of_events, names_of_invariants
+from jourdain_jax.equations.rows import names_of_events, names_of_invariants
 from jourdain_jax.integrate.constraint_projection import Usual, usual_sizes
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
 from jourdain_jax.integrate.loop import native_motion

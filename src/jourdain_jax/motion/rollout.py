@@ -39,8 +39,7 @@ from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
 from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, saved_times, set_up, solver_of, span_and_times
 from jourdain_jax.motion.trajectories import labels
-from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
-from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.trajectory import Trajectory, sketch_of_lanes
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time, shown_from_users_lines
 from jourdain_jax.scene.coordinates import check_names, parameters_of
 from jourdain_jax.scene.printing import Printed

@@ -27,8 +27,7 @@ from jourdain_jax.calculus.reals import (
     nothing_is_traced,
 )
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.rows import velocity_residual
-from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.integrate.inputs import inputs_at
 from jourdain_jax.integrate.state_projection import (
     OFF,

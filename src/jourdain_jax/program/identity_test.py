@@ -11,23 +11,80 @@ values count as equal if their difference is within their bounds. Constants in t
 from one (1e-24, 1e16) and would dominate or vanish. They are written as c = m R^j with R = 2^40 and |m|
 between 2^-20 and 2^20, and R is replaced by a random number at every probe: an identity that holds for any R
 holds for 2^40.
+
+Projection of probes on a graph: inputs move by Gauss-Newton until the constraints vanish.
 """
 
 import math
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from jourdain_jax.calculus.roots import pseudo_inverses
+from jourdain_jax.calculus.roots import nearest_root, pseudo_inverses
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.probe_projection import onto_rows
+
+
+class Projected(NamedTuple):
+    """Probes projected onto constraints, or as close as the iteration came."""
+
+    probes: Any  # of the given type: `Probes` or `IdentityProbes`
+    moved: list[str]  # names of the inputs on which the constraints depend
+    pattern: Pattern  # sparsity pattern of the constraint Jacobian with respect to these
+    slopes: list[int]  # nodes of its entries
+
+
+def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
+    """Return the probes with `inputs` (names -> nodes) moved to the nearest point where all rows are zero.
+    `limits`: limits of the steps, as in `nearest_root`.
+    """
+    graph = probes.graph
+    needed = set(graph.reachable(rows))
+    moved = {name: n for name, n in inputs.items() if n in needed}
+    pattern, slopes = _slopes_by_entries(graph, rows, list(moved.values()))
+    given = (
+        np.stack([np.broadcast_to(probes.inputs[name], probes.count) for name in moved], axis=1)
+        if moved
+        else np.zeros((probes.count, 0))
+    )
+
+    def at(x, which):
+        every = given.copy()
+        every[which] = x
+        return probes.with_inputs(dict(zip(moved, every.T, strict=True)))
+
+    def look(x, which):
+        here = at(x, which)
+        return np.asarray(here(rows)).T[which], np.asarray(here(slopes)).T[which]
+
+    x = nearest_root(look, pattern.shortest, given, **limits)[0] if moved else given
+    return Projected(at(x, slice(None)), list(moved), pattern, slopes)
+
+
+def _slopes_by_entries(
+    graph: Graph, rows: Sequence[int], variables: Sequence[int]
+) -> tuple[Pattern, list[int]]:
+    """Return the structurally nonzero derivatives of rows with respect to variables: their pattern and their
+    nodes.
+    """
+    place = {n: k for k, n in enumerate(variables)}
+    entries = [
+        (i, place[n], slope)
+        for i, row in enumerate(jacobian(graph, rows, variables))
+        for n, slope in row.items()
+        if slope != graph.zero
+    ]
+    pattern = Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place)))
+    return pattern, [slope for *_, slope in entries]
+
 
 DIGITS = 40  # bits spanned by the constants in the code of a scene before they are rescaled
 SURE = 16.0  # equal values may differ by this many bounds, because bounds are first-order

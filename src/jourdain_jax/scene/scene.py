@@ -29,13 +29,6 @@ from jourdain_jax.calculus.reals import (
 )
 from jourdain_jax.scene.bodies import Body, Visual
 from jourdain_jax.scene.contact.contacts import Contact
-from jourdain_jax.scene.contact.friction_contacts import (
-    NONE_SWITCHES,
-    Declared,
-    Switching,
-    has_friction,
-    switching_of,
-)
 from jourdain_jax.scene.coordinates import (
     Coordinates,
     Labels,
@@ -47,7 +40,15 @@ from jourdain_jax.scene.coordinates import (
 )
 from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import HeldRow, Load
-from jourdain_jax.scene.modes import Event, Modes
+from jourdain_jax.scene.modes import (
+    NONE_SWITCHES,
+    Declared,
+    Event,
+    Modes,
+    Switching,
+    has_friction,
+    switching_of,
+)
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.outside_names import NamesRead, is_function, names_read
 from jourdain_jax.scene.printing import scene_html, scene_text

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.equations.scene_parts import names_of_rows
+from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, passes
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import Indices, all_finite, at_index, eps_of, is_traced
-from jourdain_jax.equations.rows import UsualRows
-from jourdain_jax.equations.scene_parts import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters

@@ -27,8 +27,13 @@ from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, of_bodies, velocities_of
 from jourdain_jax.equations.phases import At, contact_changes, contact_events, contacts_at_start, put_back
-from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
-from jourdain_jax.equations.scene_parts import names_of_bodies, names_of_position_rows
+from jourdain_jax.equations.rows import (
+    flatten_rows,
+    names_of_bodies,
+    names_of_position_rows,
+    position_rows,
+    velocity_rows,
+)
 from jourdain_jax.equations.virtual_power import (
     energies_at,
     impressed,

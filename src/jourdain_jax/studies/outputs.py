@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.files import shortened
 from jourdain_jax.calculus.reals import Scalar, described
-from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.equations.rows import names_of_events
 from jourdain_jax.integrate.result_codes import EVENT
 from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.trajectories.labels import OF_LANES

@@ -10,10 +10,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex
 
-from jourdain_jax.analysis.families.critical import FOUND, MEANINGS, SINGULAR
+from jourdain_jax.analysis.families.critical import FOUND, MEANINGS, SINGULAR, program_of
 from jourdain_jax.analysis.families.equations import Look, SteadyEquations, null_space, numbered
 from jourdain_jax.analysis.families.special_points import SURE
-from jourdain_jax.analysis.families.special_program import program_of
 from jourdain_jax.calculus.reals import largest, static
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.scene.arguments import of_known_numbers

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.analysis.families.continuation import across, first_point, followed, special
 from jourdain_jax.analysis.families.curve import CLOSED, Point, located
 from jourdain_jax.analysis.families.equations import Modes, Motions, SteadyEquations, Vector, mode_names
 from jourdain_jax.analysis.families.periodic import OrbitEquations, PeriodicMotion
-from jourdain_jax.analysis.families.special_points import SURE
+from jourdain_jax.analysis.families.special_points import SURE, across, first_point, followed, special
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest

@@ -42,7 +42,7 @@ from jourdain_jax.calculus.reals import (
     largest,
 )
 from jourdain_jax.calculus.roots import smooth_root
-from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.equations.rows import names_of_events
 from jourdain_jax.integrate.explicit_steps import diffrax
 from jourdain_jax.integrate.inputs import as_inputs, inputs_at
 from jourdain_jax.integrate.state_projection import State, state_of

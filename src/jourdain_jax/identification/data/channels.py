@@ -46,7 +46,7 @@ from jourdain_jax.calculus.reals import (
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
-from jourdain_jax.equations.scene_parts import names_of_events
+from jourdain_jax.equations.rows import names_of_events
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.coordinates import check_name, nearest

@@ -34,8 +34,8 @@ from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.adjoint import step_back
 from jourdain_jax.integrate.loop.event_adjoint import event_back, is_located
 from jourdain_jax.integrate.loop.form import CONTROL, Form
-from jourdain_jax.integrate.loop.handover import Found, Start, constant_rows
 from jourdain_jax.integrate.loop.lanes import Lanes
+from jourdain_jax.integrate.loop.loop_function import Found, Start, constant_rows
 from jourdain_jax.integrate.loop.record import Slot
 from jourdain_jax.integrate.loop.step import IDLE, step, tried_by_stages
 from jourdain_jax.integrate.loop.transitions import is_noted, reset_back

@@ -20,8 +20,7 @@ from jourdain_jax.integrate.arrays.array_loop import Loop, cotangents
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.adjoint import moved
-from jourdain_jax.integrate.loop.handover import Found, Start
-from jourdain_jax.integrate.loop.loop_function import differentiated
+from jourdain_jax.integrate.loop.loop_function import Found, Start, differentiated
 from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start
 from jourdain_jax.integrate.setup import Begun, Setup
 from jourdain_jax.integrate.vector_fields.field import Integrated

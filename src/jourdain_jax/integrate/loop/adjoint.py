@@ -42,7 +42,6 @@ from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.loop.event_adjoint import write_event_back, write_transition_back
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.handover import Start, constant_rows
 from jourdain_jax.integrate.loop.lanes import (
     Lanes,
     MachineWriter,
@@ -54,7 +53,7 @@ from jourdain_jax.integrate.loop.lanes import (
     set_goal,
 )
 from jourdain_jax.integrate.loop.loop import COUNT, TIMES, begin_lane, goal_of, write_functions, write_job
-from jourdain_jax.integrate.loop.loop_function import MOST_KERNELS, with_tangents
+from jourdain_jax.integrate.loop.loop_function import MOST_KERNELS, Start, constant_rows, with_tangents
 from jourdain_jax.integrate.loop.rate_functions import write_pulled
 from jourdain_jax.integrate.loop.record import GOALS, TO_STATES, Slot, prepare, write_record
 from jourdain_jax.integrate.loop.samples import pass_knot

@@ -25,7 +25,7 @@ from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode
 from jourdain_jax.integrate.loop import taylor
 from jourdain_jax.integrate.loop.adjoint import flow_back, moved, rates_of_all
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.handover import Found, Start
+from jourdain_jax.integrate.loop.loop_function import Found, Start
 from jourdain_jax.integrate.loop.rate_functions import check_derivatives, event_program
 from jourdain_jax.integrate.loop.time_functions import driven
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Passed, Setup, Solved

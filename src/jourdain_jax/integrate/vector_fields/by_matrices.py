@@ -11,14 +11,17 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, is_traced, static
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.reactions import rate_of_work
-from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.gibbs_appell import (
+    GibbsAppell,
+    MinimalKinematics,
+    accelerations_of,
+    minimal_kinematics,
+)
 from jourdain_jax.equations.kinematics import motion_at, rates_by_own_speeds
-from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.phases import At, put_back
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, Privileged, Reduced, scaled, speed_scale
-from jourdain_jax.equations.rows import UsualRows, velocity_residual
-from jourdain_jax.equations.scene_parts import names_of_position_rows
+from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, velocity_residual
 from jourdain_jax.equations.virtual_power import coordinate_rates_in_modes, mass_matrix_at
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField, Watched
 from jourdain_jax.scene.identity import with_reference_parameters

@@ -4,7 +4,7 @@ surfaces and height maps.
 A contact has two velocity constraints (no slip along the two tangents of the ground). With `height="row"` it
 also has one geometric constraint (zero gap), whose multiplier is the normal force. With
 `height="coordinates"` the coordinates keep the contact point on the ground, and the normal force follows from
-Newton's equations (`dynamics/normal_forces.py`). Spin about the normal is free.
+Newton's equations (`dynamics/accelerations.py`). Spin about the normal is free.
 """
 
 from collections.abc import Callable, Iterable
