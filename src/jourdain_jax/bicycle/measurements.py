@@ -28,7 +28,7 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Indices, Scalar, real_type
+from jourdain_jax.calculus.reals import Indices, PerRow, Scalar, real_type
 from jourdain_jax.scene.coordinates import Labels, Sentences, check_name
 
 PerHanging = Float[Array, "hangings"]
@@ -188,9 +188,7 @@ def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2
     return r, across @ r - beside
 
 
-def _least_squares(
-    rows: Float[Array, "rows columns"], values: Float[Array, "rows"]
-) -> Float[Array, "columns"]:
+def _least_squares(rows: Float[Array, "rows columns"], values: PerRow) -> Float[Array, "columns"]:
     return jnp.linalg.solve(rows.T @ rows, rows.T @ values)
 
 

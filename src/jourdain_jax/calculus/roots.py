@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, all_finite, eps_of, largest, tiny_of
+from jourdain_jax.calculus.reals import Count, Flag, PerRow, Scalar, all_finite, eps_of, largest, tiny_of
 
 Unknowns = Float[Array, "unknowns"]
 
@@ -101,7 +101,7 @@ class Search(eqx.Module):
 
     trial: Unknowns
     best: Unknowns
-    f: Float[Array, "rows"]  # residuals at the best point, and their Jacobian
+    f: PerRow  # residuals at the best point, and their Jacobian
     J: Float[Array, "rows unknowns"]
     damping: Scalar
     steps: Count

@@ -20,13 +20,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
 from jourdain_jax.calculus.reals import (
+    ContactFlags,
     Count,
     Flag,
     Indices,
+    PerRow,
     Scalar,
     Speeds,
     check_kind,
@@ -89,7 +91,7 @@ class Accelerations(eqx.Module):
 
     udot: Speeds
     # lambda of minimum norm: the constraint force on the speeds is A' lambda
-    multipliers: Float[Array, "rows"]
+    multipliers: PerRow
     # columns of multipliers with A' lambda = 0, which do not affect the motion; the row of a unique
     # multiplier is zero
     spare: Float[Array, "rows rows"]
@@ -347,7 +349,7 @@ def _resultant(wrench: Wrenches, positions, sets: tuple[Indices, ...], here):
     return tuple(jnp.concatenate(parts, axis=-1) for parts in summed)
 
 
-def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> Bool[Array, "contacts"]:
+def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> ContactFlags:
     """Return which normal forces are independent of multipliers that the motion does not determine."""
     size = jnp.maximum(largest(spare.force), largest(spare.torque))
     return largest(changes, 0) <= tolerance * size

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.reals import PerCoordinate
 from jourdain_jax.dynamics.reactions import potential_resultants
 from jourdain_jax.equations.gibbs_appell import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.kinematics import coordinate_rates, of_bodies
@@ -46,7 +47,7 @@ class AdmissibleRates(eqx.Module):
     C: Float[Array, "speeds freedoms"]
     c: Float[Array, "speeds"]
     B: Float[Array, "coordinates freedoms"]
-    b: Float[Array, "coordinates"]
+    b: PerCoordinate
 
 
 class Dependence(eqx.Module):

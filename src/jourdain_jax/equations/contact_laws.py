@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import Flag, Scalar
+from jourdain_jax.calculus.reals import ContactFlags, Flag, PerContact, PerRow, Scalar
 
 # SWEEPS: Gauss-Seidel sweeps per contact; STEPS: Newton steps for one contact, one more for each
 # further contact
@@ -62,14 +62,14 @@ def solved(
 class Modes(NamedTuple):
     """The modes of all contacts, as numbers 0 or 1, and directions of slip."""
 
-    closed: Float[Array, "contacts"]
-    rolls: Float[Array, "contacts"]
+    closed: PerContact
+    rolls: PerContact
     direction: Float[Array, "contacts 2"]
 
 
 def system(
-    G: Float[Array, "rows rows"], modes: Modes, friction: Float[Array, "contacts"]
-) -> tuple[Float[Array, "rows rows"], Float[Array, "rows"]]:
+    G: Float[Array, "rows rows"], modes: Modes, friction: PerContact
+) -> tuple[Float[Array, "rows rows"], PerRow]:
     """Return K and s of `K L = -s b`, the laws of all contacts in their modes:
 
         s_n (G L + b)_n + (1 - s_n) L_n = 0,   s_t (G L + b)_t + (1 - s_t) (L_t + mu L_n e) = 0
@@ -97,10 +97,7 @@ def forces(K: Float[Array, "rows rows"], right: Float[Array, "rows columns"]) ->
 
 @jax.jit  # traced once
 def responses(
-    G: Float[Array, "rows rows"],
-    b: Float[Array, "rows columns"],
-    modes: Modes,
-    friction: Float[Array, "contacts"],
+    G: Float[Array, "rows rows"], b: Float[Array, "rows columns"], modes: Modes, friction: PerContact
 ) -> Float[Array, "rows columns"]:
     """Return the forces at all contacts in their modes, one column for each column of b, from the equations
     of `system`.
@@ -113,13 +110,13 @@ class Law(NamedTuple):
     """The contacts of one Coulomb problem; `G P + b` are their speeds or accelerations."""
 
     G: Float[Array, "rows rows"]
-    b: Float[Array, "rows"]
-    target: Float[Array, "contacts"]  # least normal response
-    friction: Float[Array, "contacts"]  # mu of slip
-    static: Float[Array, "contacts"]  # mu of sticking
-    touches: Bool[Array, "contacts"]  # whether there may be a force
-    slides: Bool[Array, "contacts"]  # slips in the direction e, whatever the response
-    begins: Bool[Array, "contacts"]  # is closed and starts to slip in an unknown direction
+    b: PerRow
+    target: PerContact  # least normal response
+    friction: PerContact  # mu of slip
+    static: PerContact  # mu of sticking
+    touches: ContactFlags  # whether there may be a force
+    slides: ContactFlags  # slips in the direction e, whatever the response
+    begins: ContactFlags  # is closed and starts to slip in an unknown direction
     e: Float[Array, "contacts 2"]
 
 
@@ -128,7 +125,7 @@ class Solution(NamedTuple):
 
     P: Float[Array, "contacts 3"]
     modes: Modes
-    holds: Bool[Array, "contacts"]
+    holds: ContactFlags
 
 
 @jax.jit
@@ -173,7 +170,7 @@ def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "con
     return P.at[j].set(jnp.append(N, jnp.where(law.slides[j], -law.friction[j] * N * law.e[j], T)))
 
 
-def _scales(G: Float[Array, "rows rows"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
+def _scales(G: Float[Array, "rows rows"]) -> tuple[PerContact, PerContact]:
     """Return 1/G_nn and 1/tr G_tt of each contact; 0 where the denominator is 0."""
     sizes = jnp.diagonal(G).reshape(-1, 3)
     sizes = jnp.stack([sizes[:, 0], sizes[:, 1] + sizes[:, 2]])
@@ -216,7 +213,7 @@ def _improved(
     return (first + by_turn @ angles).reshape(-1, 3), unit(e + angles[:, None] * n)
 
 
-def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> Bool[Array, "contacts"]:
+def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> ContactFlags:
     """Return for each contact whether the forces `P` satisfy the law in its mode, up to round-off."""
     normal, tangential = _scales(law.G)
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction

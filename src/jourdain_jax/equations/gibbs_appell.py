@@ -22,9 +22,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Speeds
+from jourdain_jax.calculus.reals import PerRow, Scalar, Speeds
 from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
 from jourdain_jax.equations.kinematics import Inertias, bias_accelerations, inertias, inertias_of, velocities
 from jourdain_jax.equations.reductions import (
@@ -120,7 +119,7 @@ class MinimalKinematics(eqx.Module):
     weights: Inertias
     split: Partition  # of the scaled rows d A c
     c: Speeds
-    d: Float[Array, "rows"]
+    d: PerRow
     rows: tuple[int, ...] = eqx.field(static=True)  # indices among the scene's rows
 
 

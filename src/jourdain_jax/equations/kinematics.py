@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Numbers, Scalar, Vector3, as_real, real_type
+from jourdain_jax.calculus.reals import Numbers, PerCoordinate, Scalar, Vector3, as_real, real_type
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
@@ -42,7 +42,7 @@ class Inertias(eqx.Module):
     inertia: Float[Array, "bodies 3 3"]  # kg m^2
 
 
-def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
+def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> PerCoordinate:
     """Return `qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))

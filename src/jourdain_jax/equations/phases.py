@@ -36,9 +36,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
+from jourdain_jax.calculus.reals import ContactFlags, Flag, PerContact, PerCoordinate, PerRow, Scalar, Speeds
 from jourdain_jax.equations.contact_laws import (
     LEAST_SLIP,
     ROUND_OFF,
@@ -112,7 +112,7 @@ class At:
         """Return the normal and the two tangential forces, N."""
         return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
 
-    def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
+    def alone(self, i: int, b: PerRow, modes: Modes | None = None) -> "Alone":
         """Return the response of contact i while the others stay in `modes` (default: the current ones)."""
         modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
         others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
@@ -135,7 +135,7 @@ class Alone(NamedTuple):
         return (self.borne[:, :3] @ own + self.borne[:, 3]).reshape(-1, 3).at[i].set(own)
 
 
-def switched(scene: Scene, motion: Motion, numbers: Float[Array, "contacts"], q, u) -> Motion:
+def switched(scene: Scene, motion: Motion, numbers: PerContact, q, u) -> Motion:
     """Return the motion at other coordinates and speeds, with contacts in the modes `numbers`."""
     inputs = jnp.concatenate([motion.inputs.array[: len(scene.inputs) - len(numbers)], numbers])
     return motion_at(scene, motion.t, q, u, inputs)
@@ -147,9 +147,9 @@ LEAST_REBOUND = 1e-6  # m/s: below this speed of rebound a contact closes
 class Changes(NamedTuple):
     """Transitions of each contact at an instant."""
 
-    strikes: Bool[Array, "contacts"]
-    stops: Bool[Array, "contacts"]  # stops slipping
-    begins: Bool[Array, "contacts"]  # starts to slip
+    strikes: ContactFlags
+    stops: ContactFlags  # stops slipping
+    begins: ContactFlags  # starts to slip
 
 
 class Struck(NamedTuple):
@@ -161,7 +161,7 @@ class Struck(NamedTuple):
     is_decided: Flag
 
 
-def _struck(at: At, touches: Bool[Array, "contacts"], strikes: Bool[Array, "contacts"], i: int) -> Struck:
+def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> Struck:
     """Return the impulses of an impact: by `impulse` at contact i, or by Moreau's law at all contacts at
     once.
     """
@@ -302,7 +302,7 @@ def _event(
     return Event(jnp.ones_like(at.motion.t), to=dict(zip(names, numbers, strict=True)), jump=jump)
 
 
-def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
+def put_back(at: At) -> tuple[PerCoordinate, Speeds]:
     """Return coordinates on the ground, with directions of slip e of length one, and speeds that satisfy the
     laws of closed contacts.
 
@@ -321,7 +321,7 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
     return jnp.append(q[: -modes.direction.size], unit(modes.direction)), _speeds_on_rows(at, at.number)
 
 
-def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
+def _speeds_on_rows(at: At, number: PerContact) -> Speeds:
     """Return `u + M^-1 A' T P` with `(T G T + 1 - T) P = -T w`, for contacts in the modes `number`.
 
     T projects the speeds w onto the parts that must vanish: normal speeds of closed contacts, slip of rolling
@@ -339,9 +339,9 @@ def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
 class Begun(NamedTuple):
     """Contacts at the start of a motion."""
 
-    numbers: Float[Array, "contacts"]  # of the modes
+    numbers: PerContact  # of the modes
     below: Scalar  # m, depth of a body below its ground; infinite if the contacts have no solution
-    q: Float[Array, "coordinates"]  # on the ground for contacts that touch
+    q: PerCoordinate  # on the ground for contacts that touch
     u: Speeds  # after an impact, if contacts strike
 
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Flag, Speeds
+from jourdain_jax.calculus.reals import Flag, PerCoordinate, PerRow, Speeds
 from jourdain_jax.calculus.roots import fixed_point
 from jourdain_jax.equations.reductions import cholesky, row_scale, speed_scale
 from jourdain_jax.equations.rows import (
@@ -48,7 +48,7 @@ class Change(NamedTuple):
 
 def least_change(
     A: Float[Array, "rows moving"],
-    r: Float[Array, "rows"],
+    r: PerRow,
     M: Float[Array, "moving moving"] | None,
     free: Bool[Array, "moving"],
     typical=None,
@@ -74,8 +74,8 @@ def least_change(
 
 class _Solved(NamedTuple):
     change: Change
-    mu: Float[Array, "rows"]
-    d: Float[Array, "rows"]
+    mu: PerRow
+    d: PerRow
     c: Float[Array, "moving"]  # zero for fixed entries
     L: Float[Array, "moving moving"] | None
     definite: Flag | None
@@ -159,9 +159,7 @@ def _closures(scene: Scene, t, q):
     return closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
 
 
-def linearised_rows(
-    scene: Scene, t, q, u, inputs
-) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
+def linearised_rows(scene: Scene, t, q, u, inputs) -> tuple[PerRow, Float[Array, "rows speeds"]]:
     """Return phi and A = d phi/du."""
     phi = lambda u: velocity_residual(scene, t, q, u, inputs)
     return phi(u), jax.jacfwd(phi)(u)
@@ -173,13 +171,13 @@ BY_AUTODIFF = RowFunctions(_closures, linearised_rows, mass_matrix_at)
 def project_positions(
     scene: Scene,
     t,
-    q: Float[Array, "coordinates"],
+    q: PerCoordinate,
     *,
     free: Bool[Array, "coordinates"] | None = None,
     iterations: int = MOST_MOVES_OF_POSITIONS,
     typical=None,
     by: RowFunctions = BY_AUTODIFF,
-) -> Float[Array, "coordinates"]:
+) -> PerCoordinate:
     """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
@@ -201,7 +199,7 @@ def project_positions(
     return fixed_point(step, ((scene, jnp.asarray(t)), (free, typical)), q, iterations, prepare)
 
 
-def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
+def _normalised(scene: Scene, q: PerCoordinate) -> PerCoordinate:
     """Normalise every quaternion to `q / |q|`. Without other constraints this is the projection, and no
     iteration is needed.
     """

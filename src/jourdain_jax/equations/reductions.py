@@ -38,7 +38,7 @@ from jourdain_jax.calculus.matrices import (
     pseudo_inverse,
     singular_values,
 )
-from jourdain_jax.calculus.reals import Flag, Scalar, Speeds, rank_cutoff
+from jourdain_jax.calculus.reals import Flag, PerRow, Scalar, Speeds, rank_cutoff
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
@@ -49,9 +49,9 @@ class ScaledProblem(eqx.Module):
     M: Float[Array, "speeds speeds"]
     f: Speeds
     A: Float[Array, "rows speeds"]
-    b: Float[Array, "rows"]
+    b: PerRow
     c: Speeds
-    d: Float[Array, "rows"]
+    d: PerRow
     usual: UsualRows | None
 
 
@@ -64,7 +64,7 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
 
 def row_scale(
     A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None
-) -> Float[Array, "rows"]:
+) -> PerRow:
     """Return the reciprocal length of each row, or of its `typical` length if that is longer; 1 for a zero
     row without a typical length.
 
@@ -218,7 +218,7 @@ class Partition(eqx.Module):
         B = self._solved(-self.A[:, np.array(self.independent, int)])
         return self.all_from(jnp.eye(len(self.independent), dtype=B.dtype), B)
 
-    def particular(self, b: Float[Array, "rows"]) -> Speeds:
+    def particular(self, b: PerRow) -> Speeds:
         """Return `c`, the solution of `A c = b` with zero independent speeds."""
         return self.all_from(jnp.zeros(len(self.independent), b.dtype), self._solved(b[:, None])[:, 0])
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import PerContact, PerRow, Scalar
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.contact.contacts import Contact, Coulomb
@@ -56,9 +56,9 @@ class UsualRows(eqx.Module):
 class ConstraintRows(eqx.Module):
     """The constraints at one state, linearised: `A udot = -drift`."""
 
-    phi: Float[Array, "rows"]  # velocity residual
+    phi: PerRow  # velocity residual
     A: Float[Array, "rows speeds"]
-    drift: Float[Array, "rows"]
+    drift: PerRow
     names: tuple[str, ...] = eqx.field(static=True)
     usual: UsualRows | None = None  # None: each row is scaled by its length at this state
 
@@ -144,7 +144,7 @@ def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
+def flatten_rows(rows: dict[str, Array], dtype) -> PerRow:
     """Return all rows in one vector."""
     return jnp.concatenate([value.reshape(-1) for value in rows.values()]) if rows else jnp.zeros(0, dtype)
 
@@ -161,7 +161,7 @@ def _position_residual(scene: Scene, t: Scalar, q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 
 
-def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
+def velocity_residual(scene: Scene, t, q, u, inputs=None) -> PerRow:
     """Return `phi(t, q, u)` of all constraints, shape (rows,), in their own units per s; zero on the
     constraints. Eqs. (6)-(9).
 
@@ -178,10 +178,10 @@ def _velocity_residual(scene: Scene, t: Scalar, q, u, inputs):
 class ContactRows(eqx.Module):
     """Gaps and speeds of all switching contacts at one state, with derivatives; three rows per contact."""
 
-    gap: Float[Array, "contacts"]
-    w: Float[Array, "rows"]
+    gap: PerContact
+    w: PerRow
     A: Float[Array, "rows speeds"]
-    drift: Float[Array, "rows"]
+    drift: PerRow
 
 
 class SwitchingRow(NamedTuple):
@@ -219,14 +219,14 @@ def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
     return {name: found[name] for name in scene.switching.contacts}
 
 
-def gaps_of(scene: Scene, pose: Pose) -> Float[Array, "contacts"]:
+def gaps_of(scene: Scene, pose: Pose) -> PerContact:
     """Return the gaps of switching contacts, in m; zero for constraints."""
     contacts = contacts_of(scene, pose)
     names, zero = scene.switching.contacts, jnp.zeros_like(pose.t)
     return jnp.stack([contacts[name].gap() if name in contacts else zero for name in names])
 
 
-def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
+def contact_speeds(scene: Scene, motion: Motion) -> PerRow:
     """Return the rates of the gaps, and the slip along both tangents, of all switching contacts, in m/s."""
     rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
     slips = [row.slip for row in switching_rows(scene, motion).values()]
@@ -249,7 +249,7 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 
 
 def contact_loads(
-    scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: Float[Array, "rows"]
+    scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: PerRow
 ) -> tuple[Load, ...]:
     """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a force
     limit give the forces A' L on the speeds.

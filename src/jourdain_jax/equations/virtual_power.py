@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, check_kind
+from jourdain_jax.calculus.reals import Entries, PerCoordinate, PerRow, Scalar, Speeds, check_kind
 from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
@@ -229,7 +229,7 @@ class ContactResponse(eqx.Module):
     rows: ContactRows
     impulses: Float[Array, "speeds rows"]  # M^-1 A', with the permanent constraints satisfied
     G: Float[Array, "rows rows"]
-    b: Float[Array, "rows"]
+    b: PerRow
 
 
 @eqx.filter_jit  # traced once
@@ -290,7 +290,7 @@ def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Ar
     return (rate[:, None] * jnp.stack([-e[:, 1], e[:, 0]], axis=1)).ravel()
 
 
-def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coordinates"]:
+def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> PerCoordinate:
     """Return rates of all coordinates, including directions of slip."""
     if not scene.switching.contacts:
         return motion.qdot.array
@@ -298,7 +298,7 @@ def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coo
     return jnp.append(motion.qdot.array[: -len(turns)], turns)
 
 
-def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:
+def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> PerRow:
     """Return the forces of contacts in their modes, N."""
     friction = jnp.stack([row.friction.sliding for row in switching_rows(scene, motion).values()])
     return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction)[:, 0]

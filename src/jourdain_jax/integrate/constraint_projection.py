@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import differentiated_as, with_derivatives_of
-from jourdain_jax.calculus.reals import Entries, Speeds, rank_cutoff, real_type, static
+from jourdain_jax.calculus.reals import Entries, PerCoordinate, PerRow, Speeds, rank_cutoff, real_type, static
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.integrate.loop import projection_kernel
@@ -79,7 +79,7 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
 
 def put_positions(
     scene: Scene, t, q, free, usual: Usual, known: tuple | None = None
-) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+) -> tuple[PerCoordinate, Float[Array, "closures"]]:
     """Return the coordinates nearest to q that satisfy the geometric constraints, and the residual. `known`:
     both results if already computed; then only derivatives are added.
     """
@@ -97,7 +97,7 @@ def put_positions(
     return with_derivatives_of(lambda _, *given: by_xla(functions_of_rows(usual), *given), known, *given)
 
 
-def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, Float[Array, "rows"]]:
+def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, PerRow]:
     """Return the speeds nearest to u that satisfy the velocity constraints, and the residual."""
     affine, determined = usual.affine, usual.determined
     if usual.program is not None and not usual.program.phi:

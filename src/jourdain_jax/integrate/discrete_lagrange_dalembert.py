@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Speeds, static
+from jourdain_jax.calculus.reals import PerRow, Scalar, Speeds, static
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
@@ -100,9 +100,7 @@ def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
     )
 
 
-def discrete_rows(
-    scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int
-) -> Float[Array, "rows"]:
+def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geometric: int) -> PerRow:
     """Return all constraint residuals over the interval. The first `geometric` ones are `g(t_1, q_1)/h`, so
     that the geometric constraints hold at every node.
     """
@@ -234,7 +232,7 @@ def _projected(args, over: Interval, q0, q1) -> Speeds:
     return jnp.linalg.solve(K, jnp.concatenate([p1 - b, -phi]))[: q1.shape[0]]
 
 
-def _kept(scene: Scene, rows: Float[Array, "rows"]) -> Float[Array, "kept_rows"]:
+def _kept(scene: Scene, rows: PerRow) -> Float[Array, "kept_rows"]:
     """Return the constraints that are not redundant everywhere."""
     return rows[np.array(structure_of(scene).kept_rows, int)]
 

@@ -16,7 +16,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.markers import stopped
-from jourdain_jax.calculus.reals import Count, Entries, Flag, Scalar, Speeds, eps_of, real_type, static
+from jourdain_jax.calculus.reals import (
+    Count,
+    Entries,
+    Flag,
+    PerCoordinate,
+    Scalar,
+    Speeds,
+    eps_of,
+    real_type,
+    static,
+)
 from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.reductions import row_scale
 from jourdain_jax.equations.rows import names_of_position_rows
@@ -45,7 +55,7 @@ class State(Printed, eqx.Module):
     """
 
     t: Scalar  # s
-    q: Float[Array, "coordinates"]
+    q: PerCoordinate
     u: Speeds
     moved_q: Scalar  # largest change of a coordinate by the projection
     moved_u: Scalar  # largest change of a speed by the projection
@@ -207,10 +217,10 @@ def _arrived(q, near_q, g, start: Guess) -> Flag:
 class _Put(NamedTuple):
     """Projected coordinates, without derivatives."""
 
-    q: Float[Array, "coordinates"]
+    q: PerCoordinate
     g: Float[Array, "closures"]
     guess: Count
-    begin: Float[Array, "coordinates"]  # starting point of Newton's method
+    begin: PerCoordinate  # starting point of Newton's method
     met: Flag  # whether a solution was found
 
 

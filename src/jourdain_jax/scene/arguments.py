@@ -25,6 +25,7 @@ from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.reals import (
     Entries,
+    PerCoordinate,
     Scalar,
     Speeds,
     at_once,
@@ -134,7 +135,7 @@ def vector_of_times(ts) -> Float[Entries, "times"]:
     return ts
 
 
-def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
+def as_coordinates(scene: Scene, q) -> PerCoordinate:
     """Return q as a vector of the scene's coordinates."""
     return _as_vector(scene, "q", q, as_scene(scene).coordinate_names.entries)
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import (
     Flag,
+    PerCoordinate,
     Speeds,
     all_finite,
     as_real,
@@ -166,7 +167,7 @@ class Coordinates:
             q[first] = 1.0
         return q
 
-    def default_rates(self, q: Float[Array, "coordinates"], u: Speeds) -> Float[Array, "coordinates"]:
+    def default_rates(self, q: PerCoordinate, u: Speeds) -> PerCoordinate:
         """Return `qdot` from the default speeds: `xdot = x_rate`,
         `d quaternion/dt = 1/2 quaternion (0, omega)`.
         """

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import (
     Entries,
+    PerCoordinate,
     Scalar,
     Speeds,
     array_module,
@@ -134,7 +135,7 @@ class Scene(eqx.Module):
         """
         raise NotImplementedError(f"scene `{type(self).__name__}` has no bodies; define `bodies(self, t, q)`")
 
-    def coordinate_rates(self, t: Scalar, q: Named, u: Named) -> Float[Array, "coordinates"]:
+    def coordinate_rates(self, t: Scalar, q: Named, u: Named) -> PerCoordinate:
         """Return `qdot = N(q,t) u + nu(q,t)`, affine in u. Default: each speed is the rate of its coordinate,
         or the body angular velocity of a quaternion.
         """
@@ -240,7 +241,7 @@ class Scene(eqx.Module):
                 )
         return replace(self, **changes)
 
-    def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, Labels]:
+    def named(self, **values: Any) -> tuple[PerCoordinate, Speeds, Labels]:
         """Return q and u with the named `values`, and the given names. Other entries have their reference
         value: zero, or the identity for quaternions.
 

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from typing import get_args
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Scalar, Shape, check_kind, checked_real, described
+from jourdain_jax.calculus.reals import PerCoordinate, Scalar, Shape, check_kind, checked_real, described
 from jourdain_jax.scene.bodies import Body, Visual
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.coordinates import Named, check_names, nearest
@@ -38,7 +38,7 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
     return bodies
 
 
-def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
+def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> PerCoordinate:
     """Return the rates of all coordinates."""
     # directions of slip are the last coordinates, with zero rates
     directions = 2 * len(scene.switching.contacts)

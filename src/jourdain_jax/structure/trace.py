@@ -24,7 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import Entries, Indices, Scalar, is_traced, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, PerRow, Scalar, is_traced, real_type
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, of_bodies, velocities_of
 from jourdain_jax.equations.phases import At, contact_changes, contact_events, contacts_at_start, put_back
 from jourdain_jax.equations.rows import (
@@ -173,13 +173,13 @@ def event_resets(
     given, modes = jnp.split(motion.inputs.array, (len(scene.inputs) - len(scene.modes.names),))
     now = jnp.concatenate([motion.q.array, motion.u.array, modes])
 
-    def stored(state: Float[Array, "rows"]) -> Scalar:
+    def stored(state: PerRow) -> Scalar:
         q, u, after = jnp.split(state, (len(motion.q.array), len(state) - len(modes)))
         return stored_by_inputs(
             scene, motion_at(scene, motion.t, q, 0.0 * u, jnp.concatenate([given, after])), of_inputs
         )
 
-    def after(event: Event) -> Float[Array, "rows"]:
+    def after(event: Event) -> PerRow:
         state = [event.jump.get(name, value) for name, value in zip(names, now, strict=False)]
         found = jnp.stack([*state, *map(event.to.get, scene.modes.names, modes)])
         return jnp.append(found, stored(found) - stored(now) if of_inputs else 0.0)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, places_of
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Indices, Scalar, static
+from jourdain_jax.calculus.reals import Indices, PerRow, Scalar, static
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.integrate.inputs import Inputs, inputs_at
 from jourdain_jax.integrate.state_projection import state_of
@@ -91,7 +91,7 @@ class Shooting(eqx.Module):
         """Return the states at the starts of pieces, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
-    def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
+    def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> PerRow:
         """Return the residual R for pieces that end at `ends`, each entry divided by the size of its
         quantity.
         """

@@ -37,7 +37,7 @@ from jourdain_jax.analysis.linear_matrices import (
     privileged_at,
     privileged_speeds,
 )
-from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, checked_real, holds, real_type
+from jourdain_jax.calculus.reals import Indices, PerCoordinate, Scalar, Speeds, checked_real, holds, real_type
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.identification.data.channels import Channel, Instrument, StopEvent
 from jourdain_jax.identification.data.delay_filter import gauss_legendre
@@ -229,7 +229,7 @@ class _Filter:
     def _independent(self, q, u) -> Float[Array, "*times states"]:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
 
-    def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
+    def _state(self, t, q: PerCoordinate, x: Float[Array, "states"]) -> State:
         """Return the state with these independent coordinates and speeds. The others follow from the
         constraints, with coordinates near q.
         """

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, is_traced, static
+from jourdain_jax.calculus.reals import Indices, PerRow, Scalar, Speeds, is_traced, static
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.reactions import rate_of_work
 from jourdain_jax.equations.gibbs_appell import (
@@ -75,7 +75,7 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
     return UsualRows(scaled, rank), jnp.concatenate([plain[: len(names_of_position_rows(scene))], norms])
 
 
-def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
+def _usual(sizes: Float[Array, "states rows"]) -> PerRow:
     """Return the median over states, or the largest value if the median is zero. NaN is ignored."""
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))

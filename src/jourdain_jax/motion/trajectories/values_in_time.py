@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.compilation import with_nan_as_a_mark, with_usual_promotion
-from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, at_index, is_traced, static
+from jourdain_jax.calculus.reals import (
+    Count,
+    PerCoordinate,
+    Scalar,
+    Speeds,
+    Vector3,
+    at_index,
+    is_traced,
+    static,
+)
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
@@ -81,7 +90,7 @@ class Record(eqx.Module):
     # J, since the start; None if all forces have potentials and no constraint does work
     work: Float[Array, "times"] | None
     t_end: Scalar  # s
-    q_end: Float[Array, "coordinates"]
+    q_end: PerCoordinate
     u_end: Speeds
     result: Count  # code, see `jourdain_jax.integrate.result_codes`
     event: Count  # index into `event_names`, -1: none
