@@ -644,6 +644,9 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: None})": (
         "input `push` of `Bead` returned `None`, expected one number; pass a function of one"
     ),
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda motion: -motion.q.x})": (
+        "A controller that reads the state is a load: compute its force from `motion.q`"
+    ),
     "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda: 1.0})": (
         "input `push` of `Bead` cannot be called with a time"
     ),

@@ -293,9 +293,10 @@ def _as_channel(f: Callable, where: str) -> Callable:
     advice = "pass a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
         channel, found = traced(f, real_type())
-    except TypeError as error:
+    except (TypeError, AttributeError) as error:
         raise ValueError(
-            f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}"
+            f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}. A controller "
+            "that reads the state is a load: compute its force from `motion.q` and `motion.u` in `loads`"
         ) from None
     if not (hasattr(found, "shape") and hasattr(found, "dtype")):
         raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")

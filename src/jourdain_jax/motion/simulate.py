@@ -110,7 +110,7 @@ def simulate(
         motion.point("disc", (0, 0.5, 0))         # path of a point fixed in the body
 
         def lean_at_end(radius):                  # a derivative with respect to a parameter
-            return jj.simulate(disc.replace(radius=radius), {"lean": 0.3}, ts=[1.0])["lean"][-1]
+            return jj.simulate(disc.replace(radius=radius), {"lean": 0.3}, ts=[0.5])["lean"][-1]
 
         slope = jax.grad(lean_at_end)(0.5)
     """
