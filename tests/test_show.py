@@ -270,6 +270,15 @@ def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path
         assert getattr(axes, f"get_{name}label")() == ("" if name == hidden else f"{name} in m")
 
 
+def test_a_floor_is_drawn_under_what_has_weight_alone():
+    free, pendulum = jj.models.FreeRigidBody(), jj.models.DoublePendulumAngles()
+    grounds = [
+        contents(jj.show(jj.simulate(scene, scene.example, t1=0.5)).html)[0]["grounds"]
+        for scene in (free, pendulum)
+    ]
+    assert [len(found) for found in grounds] == [0, 1]
+
+
 CORNERS = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 50.0]])  # mm
 FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 

@@ -10,11 +10,11 @@ import sys
 
 from sphinx.application import Sphinx
 
-OPTIONS = {
+OPTIONS = {  # the glob omits the index and the pages of source code
     "--root-selector": "article",
     "--exclude-selectors": "svg, .headerlink",
     "--include-characters": "_.",
-    "--glob": "{[!_]*.html,{howto,tutorials,reference,gallery}/**/*.html}",  # without pages of source code
+    "--glob": "{[!_g]*.html,g[!e]*.html,{howto,tutorials,reference,gallery}/**/*.html}",
 }
 
 

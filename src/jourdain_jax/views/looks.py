@@ -1,7 +1,7 @@
 """Drawings of a motion: shapes of the bodies and their contacts at all saved times that were reached. A body
 without `visuals` is drawn with the shape that its constructor, outline, contacts or inertia suggest.
 
-`grounds_of` returns the ground: contact planes, meshes of curved surfaces, or a floor below the bodies.
+`grounds_of` returns the ground: contact planes, meshes of curved surfaces, or a floor below heavy bodies.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,9 @@ from jourdain_jax.scene.bodies import Particle, RigidBody, Visual
 from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Shape, Wheel
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.contact.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+from jourdain_jax.scene.loads import Gravity
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.user_methods import contacts_of, visuals_of
+from jourdain_jax.scene.user_methods import contacts_of, loads_of, visuals_of
 from jourdain_jax.views.solids import arc, quads, revolved
 
 _COLOURS = "#1f77b4 #ff7f0e #2ca02c #d62728 #9467bd #8c564b #e377c2 #7f7f7f #bcbd22 #17becf"
@@ -62,6 +63,7 @@ class Drawn:
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
     sized: bool  # whether any body has a known size; otherwise the picture determines the size of particles
+    heavy: bool  # whether gravity acts
 
     @property
     def size(self) -> float:
@@ -100,7 +102,7 @@ def looks_at(scene: Scene, state: State) -> Drawn:
 
 
 def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
-    bodies, velocities, visuals, contacts = seen
+    bodies, velocities, visuals, contacts, heavy = seen
     paths = np.concatenate([np.asarray(body.position) for body in bodies.values()])
     first = {name: _at(body, 0) for name, body in bodies.items()}
     # radius of particles, relative to the extent of the whole motion
@@ -125,7 +127,7 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     if stated.get(""):
         still = np.zeros((len(reached), 3))
         drawn[""] = DrawnBody("", PLAIN, still, upright, still, stated[""])
-    return Drawn(ts, reached, drawn, contacts, sized)
+    return Drawn(ts, reached, drawn, contacts, sized, bool(np.any(heavy)))
 
 
 def _seen(scene, t, q, u, inputs):
@@ -141,6 +143,7 @@ def _seen(scene, t, q, u, inputs):
         {name: found.angular_velocity for name, found in motion.bodies.items()},
         visuals_of(scene, pose),
         contacts,
+        jnp.array(any(isinstance(load, Gravity) for load in loads_of(scene, motion))),
     )
 
 
@@ -240,7 +243,8 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
         )
         # draw the same ground once for all its contacts
         found.setdefault(b"".join((np.round(x, 9) + 0.0).tobytes() for x in numbers), ground)
-    return [*found.values()] or [_plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)]
+    floor = _plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)
+    return [*found.values()] or [floor] * drawn.heavy
 
 
 def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:

@@ -84,6 +84,7 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
         "ground": 12 * reach + 60 * size,
         "tile": tile,
         "thickness": 0.018 * shown,
+        "arrow": 0.3 * shown,  # length of a body's axes
         "follow": bool(follow),
         "view": np.asarray(display.view, float).tolist(),
         "play": bool(display.play),

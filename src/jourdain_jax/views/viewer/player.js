@@ -40,6 +40,31 @@ function geometryOf(shape, numbers) {
   return shade(mesh, () => 0);
 }
 
+function edgesOf(geometry, colour) {
+  // lines along sharp edges, lighter than a dark body and darker than a light one
+  const ink = new THREE.Color(colour), bright = 0.3 * ink.r + 0.6 * ink.g + 0.1 * ink.b; // linear, 0 to 1
+  ink.lerp(new THREE.Color(bright < 0.2 ? "#ffffff" : "#000000"), 0.4);
+  return new THREE.LineSegments(new THREE.EdgesGeometry(geometry, 30), new THREE.LineBasicMaterial({ color: ink }));
+}
+
+function axesOf(length) {
+  // arrows along x (red), y (green) and z (blue), seen through bodies
+  const axes = new THREE.Group(), tips = [["#d62728", [0, 0, -Math.PI / 2]], ["#2ca02c", [0, 0, 0]], ["#1f77b4", [Math.PI / 2, 0, 0]]];
+  for (const [colour, turn] of tips) {
+    const look = new THREE.MeshStandardMaterial({ color: colour, roughness: 0.6, depthTest: false, transparent: true }), arrow = new THREE.Group();
+    const shaft = new THREE.Mesh(new THREE.CylinderGeometry(0.02, 0.02, 0.8, 12), look), head = new THREE.Mesh(new THREE.ConeGeometry(0.06, 0.2, 16), look);
+    shaft.position.y = 0.4;
+    head.position.y = 0.9;
+    shaft.renderOrder = head.renderOrder = 7;
+    arrow.add(shaft, head);
+    arrow.rotation.set(...turn);
+    axes.add(arrow);
+  }
+  axes.scale.setScalar(length);
+  axes.visible = false;
+  return axes;
+}
+
 class Motion {
   // One motion: groups of shapes that move together, bars that stretch, paths that grow, and arrows.
   constructor(data, page, numbers, scene, ghost) {
@@ -47,6 +72,8 @@ class Motion {
     this.ts = numbers(data.ts);
     this.groups = [];
     this.bars = [];
+    this.bodies = new Map(); // by name
+    this.axes = [];
     const material = (colour, opacity) => {
       const clear = opacity * (ghost ? 0.3 : 1);
       const glass = { transparent: clear < 1, opacity: clear, depthWrite: clear === 1 };
@@ -54,8 +81,10 @@ class Motion {
     };
     const rod = shade(new THREE.CylinderGeometry(1, 1, 1, 16).rotateX(Math.PI / 2), () => 0), knob = shade(new THREE.SphereGeometry(1, 16, 12), () => 0);
     for (const body of data.bodies) {
-      const group = new THREE.Group();
+      const group = new THREE.Group(), axes = axesOf(page.arrow);
       scene.add(group);
+      this.bodies.set(body.name, group);
+      if (body.name && !ghost) { group.add(axes); this.axes.push(axes); }
       this.groups.push({ group, p: numbers(body.p), q: numbers(body.q), turns: numbers(body.turns) });
       for (const shape of body.shapes) {
         const look = material(shape.colour, shape.opacity);
@@ -66,7 +95,9 @@ class Motion {
           return mesh;
         };
         if (shape.kind !== "line") {
-          this.groups.push({ group: put(geometryOf(shape, numbers)), p: numbers(shape.p), q: numbers(shape.q), turns: [0] });
+          const geometry = geometryOf(shape, numbers), mesh = put(geometry);
+          if (!ghost && shape.opacity === 1) mesh.add(edgesOf(geometry, shape.colour));
+          this.groups.push({ group: mesh, p: numbers(shape.p), q: numbers(shape.q), turns: [0] });
           continue;
         }
         const all = numbers(shape.points), count = shape.count;
@@ -216,13 +247,21 @@ async function main() {
   scene.add(camera);
   page.grounds.forEach((ground) => scene.add(groundOf(ground, page, numbers)));
   const motions = page.motions.map((data, k) => new Motion(data, page, numbers, scene, k > 0));
-  const controls = new THREE.OrbitControls(camera, canvas);
+  const controls = new THREE.OrbitControls(camera, canvas), space = axesOf(1.5 * page.arrow);
+  scene.add(space);
 
   $("labels").querySelector("h1").textContent = page.title;
   for (const { name, colour } of page.names) {
-    const entry = document.createElement("span"), chip = document.createElement("i");
+    const entry = document.createElement("label"), box = document.createElement("input"), chip = document.createElement("i");
+    Object.assign(box, { type: "checkbox", checked: true });
+    box.onchange = () => {
+      entry.classList.toggle("hidden", !box.checked);
+      motions.forEach(({ bodies }) => { if (bodies.has(name)) bodies.get(name).visible = box.checked; });
+      draw();
+    };
     chip.style.background = colour;
-    entry.append(chip, name);
+    entry.title = "hide or show";
+    entry.append(box, chip, name);
     $("names").append(entry);
   }
   $("note").textContent = page.note;
@@ -315,7 +354,22 @@ async function main() {
   $("scrub").oninput = () => { play(false); now = Number($("scrub").value); draw(); };
   $("reset").onclick = () => { aim(); draw(); };
   $("follow").onchange = () => { aim(); draw(); };
-  document.onkeydown = (event) => { if (event.key === " " && event.target.tagName !== "BUTTON") { event.preventDefault(); play(!playing); } };
+  $("axes").onchange = () => { [space, ...motions[0].axes].forEach((axes) => { axes.visible = $("axes").checked; }); draw(); };
+  $("help").onclick = () => { $("keys").hidden = !$("keys").hidden; };
+  $("save").onclick = () => {
+    draw();
+    Object.assign(document.createElement("a"), { href: canvas.toDataURL("image/png"), download: `${page.title}.png` }).click();
+  };
+  const step = (by) => { play(false); now = Math.min(Math.max(now + by * (end - begin) / 50, Math.min(begin, end)), Math.max(begin, end)); draw(); };
+  const keys = {
+    " ": () => play(!playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1), "?": () => $("help").click(),
+    f: () => $("follow").click(), a: () => $("axes").click(), r: () => $("reset").click(), p: () => $("save").click(),
+  };
+  document.onkeydown = (event) => {
+    if (!(event.key in keys) || event.ctrlKey || event.metaKey || ["BUTTON", "SELECT"].includes(event.target.tagName)) return;
+    event.preventDefault();
+    keys[event.key]();
+  };
   if (page.play) play(true);
   document.body.dataset.ready = "yes";
 }
