@@ -35,8 +35,8 @@ from jourdain_jax.bicycle import (
     shipped_measurements,
 )
 from jourdain_jax.bicycle import stability_speeds as speeds_of_matrices
+from jourdain_jax.bicycle.measurements import read_readings
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
-from jourdain_jax.bicycle.readings import read_readings
 
 # %% [markdown]
 # ## Readings

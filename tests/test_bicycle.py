@@ -29,8 +29,8 @@ from jourdain_jax.bicycle import (
     table,
     write_results,
 )
+from jourdain_jax.bicycle.measurements import read_readings
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
-from jourdain_jax.bicycle.readings import read_readings
 from jourdain_jax.cli import main
 from jourdain_jax.cli.bicycle_verbs import prefixes
 

@@ -1,7 +1,6 @@
 """Public names, imported on first use; static tools read them here."""
 
 from . import analysis, bicycle, equations, identification, models, studies
-from .analysis.energy import energy, energy_balance
 from .analysis.families.chart import stability_chart
 from .analysis.families.critical import critical
 from .analysis.families.family import family
@@ -9,7 +8,7 @@ from .analysis.families.periodic import periodic
 from .analysis.linearize import linearize
 from .analysis.report import report
 from .analysis.steady import steady
-from .analysis.verify import verify
+from .analysis.verify import energy, energy_balance, verify
 from .calculus.derivative_errors import DifferentiationModeError
 from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z, vec
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions

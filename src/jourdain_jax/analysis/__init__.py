@@ -4,13 +4,13 @@
 families share. Open `report.py` or `linearize.py` first.
 """
 
-from jourdain_jax.analysis.energy import Energy, EnergyBalance
 from jourdain_jax.analysis.linearize import Linearization
 from jourdain_jax.analysis.report import Report
 from jourdain_jax.analysis.state_space import StateSpace
 from jourdain_jax.analysis.statements import derivative_exists
 from jourdain_jax.analysis.steady import SteadyMotion
 from jourdain_jax.analysis.verification import Verification
+from jourdain_jax.analysis.verify import Energy, EnergyBalance
 
 __all__ = [
     "Energy",

@@ -15,11 +15,18 @@ gradients          of udot and A' lambda: forward against reverse mode, and agai
 
 `statements.py` has the first three checks. All checks run once, without compilation, which would take several
 times longer.
+
+Compute the energy of a scene, and determine whether it is conserved.
+
+E = T + V,   T = sum m v.v/2 + omega.I omega/2
+    dE/dt = power of loads without a potential (`dynamics/reactions.py`)
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,8 +34,8 @@ import numpy as np
 from jourdain_jax.analysis.statements import by_reduction, gradient_checks, statement_checks
 from jourdain_jax.analysis.verification import Verification, check
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest, tiny_of
-from jourdain_jax.dynamics.accelerations import diagnosed, reductions
+from jourdain_jax.calculus.reals import Numbers, Scalar, Speeds, checked_whole, largest, tiny_of
+from jourdain_jax.dynamics.accelerations import bare_accelerations, diagnosed, reductions
 from jourdain_jax.dynamics.reactions import newton_residual, power, row_reactions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import (
@@ -47,6 +54,7 @@ from jourdain_jax.equations.virtual_power import (
     equations_and_rows,
     lagrange_equations,
     speeds_are_rates,
+    unconstrained_equations,
 )
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.motion.check import check as look_for_mistakes
@@ -247,3 +255,73 @@ def _acts_on_speeds(scene: Scene) -> bool:
 
     shapes_along_motion(look, scene)
     return any(flags)
+
+
+_ORIGINS = {
+    "loads": "loads without a potential",
+    "rows": "constraints that do real work",
+    "driven": "poses driven as functions of time",
+    "potential": "potentials that depend on time",
+    "inertia": "masses or inertias that change",
+}
+
+
+class Energy(eqx.Module):
+    """Energy of one state, in J: `kinetic` T, `potential` V and their `total`."""
+
+    kinetic: Scalar
+    potential: Scalar  # of all loads and the scene; loads without a potential contribute nothing
+
+    @property
+    def total(self) -> Scalar:
+        """Return T + V."""
+        return self.kinetic + self.potential
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """Whether T + V is conserved along every motion of a scene, and if not, the causes of its change."""
+
+    conserved: bool
+    changed_by: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return (
+            "T + V is conserved" if self.conserved else f"T + V is changed by {' and '.join(self.changed_by)}"
+        )
+
+
+def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
+    """Return the kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs
+    (default: zero).
+    """
+    return Energy(*energies_at(scene, motion_at(scene, t, q, u, inputs)))
+
+
+@of_known_numbers
+def energy_balance(scene: Scene) -> EnergyBalance:
+    """Report whether T + V is conserved, and the powers that change it, eqs. (71)-(73).
+
+    Eight random admissible states with random inputs are examined. A power counts as zero if it is below 1e-9
+    of the largest power (1e-4 in single precision). Raises DifferentiationModeError for traced numbers.
+    """
+    t, q, u = (jnp.asarray(x) for x in sample_states(scene, 8))
+    inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))
+    powers, size = _powers(scene, t, q, u, inputs)
+    limit = (1e-9 if q.dtype == jnp.float64 else 1e-4) * float(jnp.max(size))
+    changed_by = tuple(
+        text for name, text in _ORIGINS.items() if float(largest(getattr(powers, name))) > limit
+    )
+    changed_by += ("potentials that depend on inputs",) if structure_of(scene).potentials_of_inputs else ()
+    return EnergyBalance(not changed_by, changed_by)
+
+
+@eqx.filter_jit
+def _powers(scene: Scene, t, q, u, inputs):
+    def one(t, q, u, inputs):
+        found = bare_accelerations(scene, t, q, u, inputs)
+        equations = unconstrained_equations(scene, t, q, u, inputs)
+        forces = jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)
+        return power(scene, motion_at(scene, t, q, u, inputs), found), jnp.abs(u) @ forces
+
+    return jax.vmap(one)(t, q, u, inputs)

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.bicycle.measurements import benchmark_from_measurements
+from jourdain_jax.bicycle.measurements import benchmark_from_measurements, holds_readings
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
-from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.stability import (
     eigenvalues,
     interval,
