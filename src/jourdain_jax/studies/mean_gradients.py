@@ -83,7 +83,7 @@ def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
     """
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
-    # 2048 motions with their tangents, in one batch
+    # a batch has 2048 motions with their tangents
     size = max(8, min(task.block, 2048 // (1 + len(columns))))
     common = {
         name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared

@@ -209,7 +209,7 @@ def _chunk(task: Task, chunk: int | None) -> int:
 
 
 def versions() -> dict[str, str]:
-    """Return versions of Python and the packages that compute."""
+    """Return the versions of Python and of the packages used in the computation."""
     return {"python": python_version()} | {name: version_of(name) for name in PACKAGES}
 
 

@@ -45,7 +45,7 @@ from jourdain_jax.studies.records import (
 from jourdain_jax.studies.statistics import Tally
 
 FORMAT = 2
-MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
+MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # chunks of a study, samples of a chunk
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with warnings.catch_warnings():
-                # a warning that consolidated metadata, which xarray reads, are not yet standard
+                # Zarr warns that consolidated metadata, which xarray reads, are not yet standard
                 warnings.simplefilter("ignore")
                 group = zarr.create_group(beside, zarr_format=3, attributes=dict(attributes))
 

@@ -95,7 +95,7 @@ def read(
     first = np.clip(begins - (POINTS // 2 - 1), 0, count - POINTS)  # of the points about each interval
     some = flat[first[:, None] + np.arange(POINTS)]
     polynomials = jnp.einsum("ij,kjc->kic", coefficients, some)  # (intervals, powers, channel)
-    left = jnp.asarray(begins - first - _MIDDLE, flat.dtype)  # place of the interval's begin
+    left = jnp.asarray(begins - first - _MIDDLE, flat.dtype)  # position of the interval's start
     since = x - interval
     if lag is None:
         found, y = jax.vmap(jnp.polyval)(polynomials[interval], left[interval] + since), flat

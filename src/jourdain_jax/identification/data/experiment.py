@@ -64,7 +64,7 @@ class Reading(Response):
     """A sensor of one run, with the quantity that it measures."""
 
     operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
-    name: str = static()  # of the coordinate, speed or event
+    name: str = static()  # name of the coordinate, speed or event
 
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
         """Return the measured quantity along a motion. `states`: the motions of bodies, for functions of a

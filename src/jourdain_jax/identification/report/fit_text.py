@@ -18,7 +18,7 @@ from jourdain_jax.scene.printing import table
 def warnings_of(fit: Estimates) -> Sentences:
     """Return warnings of a fit of one experiment, one sentence each, the most serious first."""
     if not np.isfinite(fit.chi_square):
-        # sigmas: the square overflows
+        # residuals in sigmas whose squares overflow
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
         failed = "the motion fails at the first guess; examine it with `simulate`"

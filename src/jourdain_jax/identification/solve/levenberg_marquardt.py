@@ -67,7 +67,7 @@ class Control:
     most_steps: int
     cutoff: float
     patience: int = 2**31  # steps within which F must fall to a quarter
-    near: float = 0.0  # F below which it may fall more slowly
+    near: float = 0.0  # F below which it may decrease more slowly
 
 
 @dataclass
