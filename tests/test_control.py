@@ -1,5 +1,6 @@
 """State space models of small motions: outputs by name, minimal models, and controllers of python-control."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +71,36 @@ def test_outputs_may_be_functions_of_a_motion(hanging):
         hanging.state_space({"bob": lambda motion: motion["a"].position})
     with pytest.raises(ValueError, match=r"`outputs` names `c`, .*valid names"):
         hanging.state_space("c")
+
+
+class OnBelt(jj.Scene):
+    """A particle of 1 kg whose speed along y is an input, and depends on that along x."""
+
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("belt pull")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jj.vec(q.x, q.y, 0))}
+
+    def velocity_constraints(self, motion):
+        return {"belt": motion.u.y_rate - motion.inputs.belt - 0.3 * motion.u.x_rate}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.pull),)
+
+
+def test_an_input_of_a_constraint_passes_directly_to_a_dependent_speed():
+    model = jj.linearize(OnBelt(), {}).state_space("y_rate")
+    assert model.states == ("x", "y", "x_rate")
+    assert_allclose(model.C, [[0.0, 0.0, 0.3]], atol=1e-15)
+    assert_allclose(model.D, [[1.0, 0.0]], atol=1e-15)
+
+
+def test_what_has_no_minimal_model_is_refused(hanging):
+    with pytest.raises(ValueError, match="no input moves `TiltingDisc` at this state"):
+        jj.linearize(jj.models.TiltingDisc(), {"spin_rate": -4.0}).minimal()
+    with pytest.raises(jj.DifferentiationModeError, match="`minimal` was called inside jit"):
+        jax.jit(lambda x: eqx.tree_at(lambda found: found.A, hanging, x).minimal().A)(hanging.A)
 
 
 def test_a_model_is_printed_with_its_names(hanging):

@@ -200,6 +200,8 @@ class Linearization(Printed, eqx.Module):
         x, y and yaw of a bicycle. States that other states determine, if only the inputs move the scene, are
         also omitted, such as the forward speed of a bicycle, or one of two equal pendulums on a cart. Modes
         that only initial values can excite are lost, even if they grow: compare `state_eigenvalues`.
+
+        Raises ValueError for an unknown name, and if no input moves the scene.
         """
         first = sum(name not in self.about[0].speed_names.entries for name in self.states)
         return minimal(self.state_space(outputs), first, outputs is not None)

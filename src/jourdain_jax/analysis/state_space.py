@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import described, rank_cutoff, static
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.coordinates import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed, matrix
 from jourdain_jax.structure.rank import pivot_columns
@@ -89,6 +90,7 @@ def _row(name: str, of: Callable, followed: Float[Array, "all independent"], slo
     return found
 
 
+@of_known_numbers
 def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
     """Return the model without states on which neither speeds nor (if `named`) outputs depend, directly or
     through others, and without states that other states determine if only the inputs move the scene.
@@ -112,6 +114,8 @@ def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
         seen = seen | np.any(a[seen] != 0, axis=0)
     places = np.flatnonzero(seen)
     moved = _controllable(a[np.ix_(places, places)], b[places], cutoff)
+    if not moved.size:
+        raise ValueError(f"no input moves `{model.title}` at this state, so its minimal model has no states")
     kept = list(pivot_columns(moved.T, moved.shape[1]))
     X = moved / size[places, None]
     X = X @ np.linalg.inv(X[kept])
