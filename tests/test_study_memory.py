@@ -89,7 +89,7 @@ def test_a_rollout_runs_fewer_lanes_at_once_where_its_model_has_little_memory(ca
 
 def test_too_little_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(
-        ValueError, match="`memory` allows 100 MB for each computing process, but this process holds"
+        ValueError, match="`memory` allows 100 MB for each computing process, but this process uses"
     ):
         run(tmp_path / "discs.zarr", memory="100MB")
     with pytest.raises(ValueError, match="a new process uses 240 MB before the study begins"):
