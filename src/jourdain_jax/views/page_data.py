@@ -167,8 +167,8 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """Return the number of whole turns of a body between saved times, in addition to the shortest rotation.
-    Fast wheels make whole turns between two saved times.
+    """Return the number of whole turns of a body between saved times, as of fast wheels, in addition to the
+    shortest rotation.
     """
     if len(ts) < 2:
         return np.zeros(1)

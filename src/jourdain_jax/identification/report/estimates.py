@@ -217,7 +217,7 @@ class Estimates(Printed):
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """Return the correlation of neighbouring whitened residuals of each channel over all runs, and the
+        """Return, for each channel over all runs, the correlation of neighbouring whitened residuals, and the
         limit 3.5 / sqrt(pairs), which white noise rarely exceeds.
         """
         found = {}
@@ -250,8 +250,8 @@ class Estimates(Printed):
         are not identifiable separately. The result is NaN if it depends on an undetermined direction, or on
         an unknown at its bound.
 
-        - `function`: plain JAX, of a scene; returns an array of any shape. `unit`: of the result, for
-          `print`.
+        - `function`: a function of a scene, in plain JAX, that returns an array of any shape. `unit`: unit of
+          the result, for `print`.
 
         **Returns** value, standard error and ends of the interval in that shape; for a batch with a leading
         axis `repeats`. **Raises** ValueError if the function returns no numbers. Source: C. R. Rao, Linear
