@@ -57,6 +57,9 @@ class Picture:
 
 
 SCENE_PICTURES = {
+    "coin": Picture(
+        title="Dropped coin", at="(0.0, 0.15, 0.4, 0.6)", span="0.6", paths='[("coin", (0.0, 0.0, 0.0))]'
+    ),
     "robot_with_trailer": Picture(
         title="Robot with a trailer",
         view='"above"',
