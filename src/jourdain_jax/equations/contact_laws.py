@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import ContactFlags, Flag, PerContact, PerRow, Scalar
+from jourdain_jax.calculus.reals import ContactFlags, ContactVectors, Flag, PerContact, PerRow, Scalar
 
 # SWEEPS: Gauss-Seidel sweeps per contact; STEPS: Newton steps for one contact, one more for each
 # further contact
@@ -123,7 +123,7 @@ class Law(NamedTuple):
 class Solution(NamedTuple):
     """Forces and modes of all contacts, and whether they satisfy the law, by contact."""
 
-    P: Float[Array, "contacts 3"]
+    P: ContactVectors
     modes: Modes
     holds: ContactFlags
 
@@ -156,7 +156,7 @@ def coulomb(law: Law) -> Solution:
 
 
 @partial(jax.jit, static_argnums=2)
-def _swept(law: Law, P: Float[Array, "contacts 3"], j: int) -> Float[Array, "contacts 3"]:
+def _swept(law: Law, P: ContactVectors, j: int) -> ContactVectors:
     """Return the forces after one Gauss-Seidel step at contact j: its force by the law, for the given
     other forces.
     """
@@ -177,7 +177,7 @@ def _scales(G: Float[Array, "rows rows"]) -> tuple[PerContact, PerContact]:
     return tuple(jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1.0), 0.0))
 
 
-def _modes(law: Law, P: Float[Array, "contacts 3"]) -> Modes:
+def _modes(law: Law, P: ContactVectors) -> Modes:
     """Return the modes of all contacts under the forces `P`."""
     normal, tangential = _scales(law.G)
     w = (law.G @ P.ravel() + law.b).reshape(-1, 3)
@@ -189,9 +189,7 @@ def _modes(law: Law, P: Float[Array, "contacts 3"]) -> Modes:
 
 
 @jax.jit
-def _improved(
-    law: Law, P: Float[Array, "contacts 3"], modes: Modes
-) -> tuple[Float[Array, "contacts 3"], Float[Array, "contacts 2"]]:
+def _improved(law: Law, P: ContactVectors, modes: Modes) -> tuple[ContactVectors, Float[Array, "contacts 2"]]:
     """Return forces and directions of slip after one step of Newton's method.
 
     The unknowns are the forces P and the angles of those directions e that are unknown. The equation of an
@@ -213,7 +211,7 @@ def _improved(
     return (first + by_turn @ angles).reshape(-1, 3), unit(e + angles[:, None] * n)
 
 
-def holds(law: Law, P: Float[Array, "contacts 3"], modes: Modes) -> ContactFlags:
+def holds(law: Law, P: ContactVectors, modes: Modes) -> ContactFlags:
     """Return for each contact whether the forces `P` satisfy the law in its mode, up to round-off."""
     normal, tangential = _scales(law.G)
     w, e = (law.G @ P.ravel() + law.b).reshape(-1, 3), modes.direction

@@ -38,7 +38,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import ContactFlags, Flag, PerContact, PerCoordinate, PerRow, Scalar, Speeds
+from jourdain_jax.calculus.reals import (
+    ContactFlags,
+    ContactVectors,
+    Flag,
+    PerContact,
+    PerCoordinate,
+    PerRow,
+    Scalar,
+    Speeds,
+)
 from jourdain_jax.equations.contact_laws import (
     LEAST_SLIP,
     ROUND_OFF,
@@ -108,7 +117,7 @@ class At:
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
 
     @property
-    def forces(self) -> Float[Array, "contacts 3"]:
+    def forces(self) -> ContactVectors:
         """Return the normal and the two tangential forces, N."""
         return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
 
@@ -130,7 +139,7 @@ class Alone(NamedTuple):
     # forces of all contacts: three columns per unit force of this one, one without it
     borne: Float[Array, "rows 4"]
 
-    def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "contacts 3"]:
+    def every(self, i: int, own: Float[Array, "3"]) -> ContactVectors:
         """Return the forces of all contacts if contact i has the force `own`."""
         return (self.borne[:, :3] @ own + self.borne[:, 3]).reshape(-1, 3).at[i].set(own)
 
@@ -155,7 +164,7 @@ class Changes(NamedTuple):
 class Struck(NamedTuple):
     """Impulses at all contacts, their modes during the impact, and whether the result is valid."""
 
-    P: Float[Array, "contacts 3"]
+    P: ContactVectors
     modes: Modes
     has_law: Flag
     is_decided: Flag

@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.calculus.reals import PerLane, largest
+from jourdain_jax.calculus.reals import PerLane, PerTime, largest
 from jourdain_jax.integrate.inputs import Inputs, Sampled
 
 
-def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
+def knots_between(holders: PyTree, rtol, t0, t1, ts: PerTime) -> Float[Array, "knots"] | None:
     """Return the knots of all `Sampled` in `holders` at which steps must end: times since `t0`, in the order
     of the motion, excluding the times `ts`. At least one infinite time follows. None if there are no samples.
     """

@@ -30,9 +30,9 @@ from jourdain_jax.calculus.reals import (
     is_traced,
     real_type,
 )
-from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.program.eager import uncompiled_lanes
+from jourdain_jax.program.evaluate import depend_on
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.coordinates import check_names
 from jourdain_jax.scene.outside_names import now_read_by

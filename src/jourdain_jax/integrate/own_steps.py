@@ -33,7 +33,7 @@ from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, Ve
 from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.lowering.sides import loads_have_relations, loads_may_jump, with_sides
-from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.evaluate import depend_on
 from jourdain_jax.program.graph import ARRAYS
 from jourdain_jax.scene.scene import Scene
 

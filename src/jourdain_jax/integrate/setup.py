@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.reals import Entries, Flag, PerLane, Scalar, eps_of
+from jourdain_jax.calculus.reals import Entries, Flag, PerLane, PerTime, Scalar, eps_of
 from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
@@ -37,7 +37,7 @@ class Passed(eqx.Module):
     modes: Float[Entries, "modes transitions *lanes"]  # after each event
 
     def times(
-        self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
+        self, origin: Scalar, ts: PerTime, goals: PerTime, direction: Scalar
     ) -> Float[Array, "transitions"]:
         """Return the times of transitions, rounded consistently with the saved times `ts`.
 

@@ -23,8 +23,7 @@ import numpy as np
 
 from jourdain_jax.lowering.lowered_equations import NODES, Lowered
 from jourdain_jax.lowering.relations import AGREE, COMPARED, WHOLE, branches, counted, jumps, switches, where
-from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import Probes, depend_on
 from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.scene import Scene

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.markers import stopped
-from jourdain_jax.calculus.reals import Flag, Scalar, eps_of
+from jourdain_jax.calculus.reals import Flag, PerTime, Scalar, eps_of
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod
@@ -60,7 +60,7 @@ def conserves(setup: Setup) -> bool:
 def energies_near(
     setup: Setup,
     args,
-    states: tuple[Float[Array, "times"], Float[Array, "times rows"], Float[Array, "times inputs"]],
+    states: tuple[PerTime, Float[Array, "times rows"], Float[Array, "times inputs"]],
     of_rows: Callable[[Array], Integrated],
 ) -> tuple[Float[Array, "times 2"], Float[Array, "times 2"]]:
     """Return T and V (J) at the states, and again with each coordinate and speed increased by its tolerance.
@@ -97,10 +97,7 @@ def energy_lost(at: Float[Array, "times 2"], near: Float[Array, "times 2"], step
 
 
 def rows_violated(
-    setup: Setup,
-    t: Float[Array, "times"],
-    q: Float[Array, "times coordinates"],
-    u: Float[Array, "times speeds"],
+    setup: Setup, t: PerTime, q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]
 ) -> Flag:
     """Return whether any constraint is violated at any of these states. Unreached states (NaN) are ignored.
 

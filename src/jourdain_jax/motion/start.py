@@ -40,8 +40,8 @@ from jourdain_jax.integrate.state_projection import (
     put_onto_constraints,
 )
 from jourdain_jax.motion.model import Model, modelled
-from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.program.evaluate import depend_on
 from jourdain_jax.scene.arguments import (
     BuiltFor,
     as_coordinates,

@@ -27,9 +27,8 @@ from jourdain_jax.calculus.roots import nearest_root, pseudo_inverses
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.calculus.sparse_slopes import Pattern
-from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import Probes, depend_on
 from jourdain_jax.program.graph import Graph
 
 

@@ -19,9 +19,8 @@ from jourdain_jax.calculus.reals import Entries, real_type, static
 from jourdain_jax.calculus.roots import nearest_root, shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
-from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import derivatives, jacobian
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import CALLS, NONANALYTIC, Probes, decided_by, depend_on, passes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, is_combination, on_rows
 from jourdain_jax.scene.identity import once_per_class

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import Indices
-from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
-from jourdain_jax.program.evaluate import part_of
+from jourdain_jax.program.evaluate import depend_on, part_of
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.scene.coordinates import parameter_faults

@@ -18,8 +18,7 @@ import numpy as np
 
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.equations.rows import names_of_rows
-from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, passes
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import CALLS, NONANALYTIC, Probes, passes
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.probes import looked_at, projected
 from jourdain_jax.structure.trace import named_values, owned

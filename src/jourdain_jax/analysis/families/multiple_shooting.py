@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, ByProgram, places_of
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Indices, PerRow, Scalar, static
+from jourdain_jax.calculus.reals import Indices, PerRow, PerTime, Scalar, static
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.integrate.inputs import Inputs, inputs_at
 from jourdain_jax.integrate.state_projection import state_of
@@ -56,7 +56,7 @@ class Shooting(eqx.Module):
         n = len(self.scene.coordinate_names.entries)
         return z[:n], z[n:]
 
-    def motion(self, t0, z: States, ts: Float[Array, "times"]):
+    def motion(self, t0, z: States, ts: PerTime):
         """Return the motion from a state."""
         start = state_of(self.scene, t0, *self.split(z))
         return simulate(

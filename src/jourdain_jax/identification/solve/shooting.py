@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import Entries, Number, Scalar, checked_real, checked_whole
+from jourdain_jax.calculus.reals import Entries, Number, PerTime, Scalar, checked_real, checked_whole
 from jourdain_jax.identification.data.channels import Channel, StopEvent
 from jourdain_jax.identification.data.delay_filter import FEWEST_INTERVALS, Times, grid, intervals
 from jourdain_jax.identification.data.experiment import (
@@ -65,10 +65,7 @@ def begin(scene: Scene, start: dict, t0):
 
 
 def ended(
-    motion: Trajectory,
-    filters: Sequence[Float[Array, "times entries"]],
-    start: dict,
-    ts: Float[Array, "times"],
+    motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], start: dict, ts: PerTime
 ) -> dict[str, Float[Array, "states"]]:
     """Return the end state of a piece; empty for a whole run. `ts`: the times of the motion."""
     if LAST not in start:

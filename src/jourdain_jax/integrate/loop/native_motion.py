@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.markers import entries_of
-from jourdain_jax.calculus.reals import Indices, Scalar, Shape, real_type
+from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, Shape, real_type
 from jourdain_jax.integrate.explicit_steps import Method, code_at_end
 from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop import taylor
@@ -273,9 +273,7 @@ def others_of(inputs: Inputs) -> list[Callable]:
     return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
 
-def _samples(
-    args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None
-) -> tuple[Array, ...]:
+def _samples(args: tuple, goals: PerTime, knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
     """Return the tables and knots of sampled inputs, as arguments of the kernel; empty if there are none."""
     _, _, inputs, _, origin = args
     origin = jax.lax.stop_gradient(origin)  # samples are interpolated at fixed times since the start
@@ -296,7 +294,7 @@ def _samples(
     return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
 
 
-def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
+def solved(form: Form, goals: PerTime, found: Found) -> Solved:
     """Return the result of a loop as a `Solved`."""
     h, pivot, count = (found.rest[i] for i in (0, 5, 7))
     (states,), (end,), (t,), (log,) = found[:4]

@@ -11,8 +11,7 @@ import numpy as np
 from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, TimeProgram
 from jourdain_jax.lowering.lowered_equations import NODES, Lowered
 from jourdain_jax.lowering.relations import jumps, sided, switches
-from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.evaluate import Probes, depend_on
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.structure.trace import Variables

@@ -13,6 +13,7 @@ from jourdain_jax.calculus.compilation import with_nan_as_a_mark, with_usual_pro
 from jourdain_jax.calculus.reals import (
     Count,
     PerCoordinate,
+    PerTime,
     Scalar,
     Speeds,
     Vector3,
@@ -84,11 +85,11 @@ class Record(eqx.Module):
     """Numbers of a motion; NaN at unreached times."""
 
     scene: Scene
-    ts: Float[Array, "times"]  # s
+    ts: PerTime  # s
     q: Float[Array, "times coordinates"]
     u: Float[Array, "times speeds"]
     # J, since the start; None if all forces have potentials and no constraint does work
-    work: Float[Array, "times"] | None
+    work: PerTime | None
     t_end: Scalar  # s
     q_end: PerCoordinate
     u_end: Speeds
