@@ -578,7 +578,8 @@ def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes
 def test_a_first_block_on_which_processes_die_ends_the_study(tmp_path):
     """Every process begins with it: all others would die, too."""
     with pytest.raises(
-        RuntimeError, match=r"processes died 3 times on samples 0 to 31 of .*with which every process begins"
+        RuntimeError,
+        match=r"processes died 3 times on samples 0 to 31 of .*; every process computes these first",
     ):
         _with_deaths(tmp_path / "discs.zarr", (), first_block=True)
 

@@ -82,8 +82,8 @@ class StabilitySpeeds(eqx.Module):
 
 
 def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
-    """Return the state of upright straight running at `speed` (m/s), a steady motion, with the lean rate
-    `lean_rate` (rad/s). The state satisfies the constraints exactly.
+    """Return the state of upright straight running at `speed` (m/s), a steady motion if `lean_rate` (rad/s)
+    is zero. The state satisfies the constraints exactly.
     """
     q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
     return state_of(bicycle, 0.0, q, u)

@@ -53,7 +53,7 @@ def _parted(arguments: tuple) -> tuple[list, _Leaves]:
 
 
 def is_zero(tangent) -> bool:
-    """Return whether a tangent is zero, as passed to a rule with symbolic zeros."""
+    """Return whether a tangent that JAX passes to a derivative rule is known to be zero."""
     return isinstance(tangent, SymbolicZero) or tangent.dtype == jax.dtypes.float0
 
 

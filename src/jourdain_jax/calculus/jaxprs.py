@@ -36,8 +36,8 @@ def evaluated(
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """Return `closed` without the equations that its outputs do not need, also inside calls. `outputs`:
-    indices of the outputs to keep (default: all).
+    """Return `closed` without the equations that its outputs do not need, including those inside calls.
+    `outputs`: indices of the outputs to keep (default: all).
     """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
@@ -83,7 +83,7 @@ def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
 
 
 def loops(jaxpr: Jaxpr) -> Iterator[str]:
-    """Yield the names of all loops in order, also inside calls."""
+    """Yield the names of all loops in order, including loops inside calls."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in LOOPS:
             yield equation.primitive.name

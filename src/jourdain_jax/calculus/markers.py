@@ -34,7 +34,7 @@ from jourdain_jax.calculus.reals import Flag, Scalar
 
 
 def identity(name: str) -> Primitive:
-    """Return a primitive called `name` that returns its operands unchanged, also when batched. The primitive
+    """Return a primitive called `name` that returns its operands unchanged, even when batched. The primitive
     has no derivative.
     """
     primitive = Primitive(name)

@@ -142,7 +142,7 @@ def checked_positive(value, what: str, shape: Shape | None = (), *, advice: str 
 def checked_known(
     value, what: str, shape: Shape | None = None, *, advice: str = "check how it was built"
 ) -> np.ndarray:
-    """Return a concrete `value` as a NumPy array of the default float, also inside `jit`. Arguments and
+    """Return a concrete `value` as a NumPy array of the default float, even inside `jit`. Arguments and
     errors as for `checked_real`.
     """
     if type(value) is float and not shape:
@@ -158,8 +158,8 @@ def checked_known(
 
 
 def checked_unless_traced(value, what: str, shape: Shape | None = None, *, advice: str):
-    """Return `value` in the default float: a NumPy array if concrete, also inside `jit`; a JAX array if
-    traced. Raises the same errors as `checked_real`.
+    """Return `value` in the default float: a concrete value as a NumPy array, even inside `jit`; a traced
+    value as a JAX array. Raises the same errors as `checked_real`.
     """
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())

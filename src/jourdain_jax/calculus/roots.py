@@ -14,7 +14,7 @@ the last sample has converged.
 `fixed_point` computes x together with D for the entries of a and x_0 that vary, so both modes of
 differentiation run one loop. If the iteration converges quadratically, each further step doubles the order of
 correct derivatives; two steps without change give derivatives up to the third. Once all samples have settled,
-the remaining steps are skipped, also under `vmap`.
+the remaining steps are skipped, even under `vmap`.
 
 `nearest_root` treats rows as dependent if the triangular factor of the scaled rows has a small diagonal. In
 that case it drops small singular values.

@@ -160,7 +160,7 @@ def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
 
 
 def vec(x: Number, y: Number, z: Number) -> Float[Array, "*times 3"]:
-    """Return the vector (x, y, z) of three numbers, also traced ones: `jj.vec(q.x, q.y, 0)`.
+    """Return the vector (x, y, z) of three numbers, even traced ones: `jj.vec(q.x, q.y, 0)`.
 
     Arrays of equal shape, such as values along a motion, give a vector for each entry.
     """

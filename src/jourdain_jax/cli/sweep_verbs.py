@@ -186,13 +186,14 @@ def _varying(name: str, how):
     kinds = (*VARYING, "levels", "table")
     if not isinstance(how, Mapping) or len(how) != 1:
         raise ValueError(
-            f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}"
+            f"the distribution of `{name}` is {described(how)}; write, for example, "
+            f"{name} = {{ normal = [1.0, 0.1] }}"
         )
     ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
         raise ValueError(
-            f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of "
-            f"numbers; {nearest(kind, kinds)}"
+            f"`{name}` has the distribution {kind} = {numbers}, expected a distribution and its numbers, "
+            f"as in normal = [1.0, 0.1]; {nearest(kind, kinds)}"
         )
     if kind not in VARYING:
         return Levels(numbers) if kind == "levels" else numbers

@@ -270,7 +270,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
 
 
 def contact_changes(at: At) -> dict[str, Event]:
-    """Return an event, with the state and the modes afterwards, for each event of the switching contacts."""
+    """Return the events of the switching contacts by name, each with the state and the modes after it."""
     events = {}
     for i, name in enumerate(at.scene.switching.contacts):
         number, own = at.number[i], jnp.arange(len(at.number)) == i

@@ -54,13 +54,13 @@ class FitFields(OptionFields, total=False):
 
 
 def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
-    """Return the minimum from each `theta`. If there is none, or if residuals are far beyond their sigmas,
-    also fit over growing spans, and return the lower minimum.
+    """Return the minimum reached from each `theta`. If none is reached, or if residuals are far beyond their
+    sigmas, fit over growing spans as well, and return the lower of both results.
 
     Over a short span, a motion depends almost linearly on its unknowns, even if it is unstable. Each fit
     starts at the result over the shorter span. Unknowns that a short span does not determine stay near the
-    first guess. A fit that makes no progress far from a minimum is interrupted, and continued only if growing
-    spans do not lead to small residuals either. With several first guesses, growing spans are used only if no
+    first guess. A fit that makes no progress far from a minimum is interrupted. It is resumed only if growing
+    spans do not lead to small residuals. With several first guesses, growing spans are used only if no
     guess led to small residuals.
     """
     samples, control = problem.samples, problem.asked.control
@@ -148,7 +148,7 @@ def fit(
     shooting: MultipleShooting | None = None,
     **by_name: Unpack[FitFields],
 ) -> Fit:
-    """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their
+    """Estimate the `free` parameters of a scene, unknown initial values of its runs and parameters of their
     sensors, from measurements.
 
     **Arguments**

@@ -374,7 +374,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
             depend_on(traced.graph, traced.at.phi.tolist(), [node])
         ):
             continue
-        with jax.ensure_compile_time_eval():  # all values are concrete, also inside a `jit`
+        with jax.ensure_compile_time_eval():  # all values are concrete, even inside `jit`
             values, ts = uncompiled_lanes(channel), np.linspace(float(t0), float(t1), 257)[:, None]
             for _, _, behind in jumps(
                 lambda t, values=values: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:]

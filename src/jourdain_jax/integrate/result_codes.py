@@ -1,4 +1,4 @@
-"""Result codes of motions. Each motion, also of a batch, has a result code instead of raising an exception.
+"""Result codes of motions. Each motion, even in a batch, has a result code instead of raising an exception.
 
 Codes up to `EVENT` mark motions that reached the end of their span or an event; all others failed.
 """

@@ -244,7 +244,7 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), y, length=steps)[0]
 
     def watched(self, has_events: bool) -> Nodes:
-        """Return the numbers of relations whose signs are monitored: those of the rates and, with
+        """Return the nodes whose signs are monitored: those that decide relations in the rates and, with
         `has_events`, of the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
@@ -285,8 +285,8 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
 
 
 def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane | None:
-    """Return the smallest magnitude of the pivots, at most 1, with the sign of their product; None if there
-    are none.
+    """Return the smallest of 1 and the magnitudes of all pivots, with the sign of the product of the pivots;
+    None if there are no pivots.
     """
     if not len(pivots):
         return None

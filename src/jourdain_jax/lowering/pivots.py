@@ -4,14 +4,14 @@ regular.
 A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first.
 Other pivots are rated by their smallest value over all probes, relative to their row. Among good pivots, the
 one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
-eliminated together if their determinant cannot vanish. An example are components of the velocity of a hitch
-in rotated axes: each entry is zero at some angle, but the determinant depends only on parameters.
+eliminated together if their determinant cannot vanish. For example, the velocity of a hitch in rotated axes
+gives entries that each vanish at some angle, but their determinant depends only on parameters.
 
-If no order of elimination works, rows are combined. The rows with entries a_1, a_2, ... in one column give
-one row with the pivot sum w_i a_i^2, and the other rows are made orthogonal to it. For example, the
+If no order of elimination works, rows are combined. The rows with entries `a_1, a_2, ...` in one column give
+one row with the pivot `sum w_i a_i^2`, and the other rows are made orthogonal to it. For example, the
 constraints of a rolling wheel along the world axes become constraints along and across its heading. In exact
-arithmetic, such a pivot is the squared distance of its column from the earlier columns, which is at least the
-smallest singular value squared. It is valid also for more rows than unknowns, even if each row vanishes
+arithmetic, such a pivot is the squared distance of its column from the span of the earlier columns, and at
+least the square of the smallest singular value. There may be more rows than unknowns, and each row may vanish
 somewhere.
 """
 
@@ -170,7 +170,7 @@ class Pivots:
     # quality at probes in the domain, and at far probes at which the system itself is regular
 
     def _regular_everywhere(self, place: tuple[int, int]) -> bool:
-        """Return whether an entry is far from zero wherever the system is regular, also beyond the domain."""
+        """Return whether an entry is far from zero wherever the system is regular, even beyond the domain."""
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
         size = np.min(np.abs(ratio), initial=np.inf)

@@ -115,9 +115,10 @@ def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int])
 def relations(
     graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes, modes: Sequence[int]
 ) -> tuple[Indices, Indices]:
-    """Return the numbers whose signs are monitored: those of the rates, and further numbers of events.
+    """Return the nodes whose signs are monitored: those that decide relations in the rates, and further ones
+    that decide relations in events.
 
-    Numbers that depend on `modes` are omitted, because modes have their own events.
+    Nodes that depend on `modes` are omitted, because modes have their own events.
     """
     found: list[NodeList] = []
     for outputs, excess in ((rates, _difference), (events, _dip)):

@@ -226,5 +226,5 @@ def _lowest(t, y: PyTree, args, *, terms, **kwargs):
     """Return the lowest value of all stop events, as a single event. Of several events in one step, diffrax
     would report the first in the list, not the earliest.
     """
-    direction = terms.contr(0.0, 1.0)  # in diffrax, time increases also in a backward motion
+    direction = terms.contr(0.0, 1.0)  # in diffrax, time increases even in a backward motion
     return jnp.min(integrands.events(t * direction, y, args))

@@ -1,4 +1,4 @@
-"""Detect drift of energy and constraints along a motion. Drift sets a result code, also inside `jit` and for
+"""Detect drift of energy and constraints along a motion. Drift sets a result code, even inside `jit` and for
 each sample of a batch.
 
 *Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about

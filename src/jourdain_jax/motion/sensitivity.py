@@ -150,7 +150,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
 
 
 def numbers_where_known(values):
-    """Return the values as numbers, also while they are differentiated outside `jit`; None if traced."""
+    """Return the values as numbers, even while they are differentiated outside `jit`; None if traced."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
     if is_traced(bare):
         return None

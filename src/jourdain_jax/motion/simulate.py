@@ -218,8 +218,8 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
-    """Return the start on its constraints. A `State` is returned unchanged, with the typical sizes by which
-    the compiled program will project it.
+    """Return the start, and the typical sizes by which the compiled program will project it. Only a `State`
+    is projected there; any other start is projected here, and the sizes are None.
     """
     if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None

@@ -89,7 +89,7 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
     given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):  # cheaper check first
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
-    # evaluate concrete numbers at once, also within a trace, which would otherwise compile each operation
+    # evaluate concrete numbers at once, even within a trace, which would otherwise compile each operation
     with at_once():
         state, arrived = _compiled_projection(*given, None)
         # not compiled: rarely needed, and slow to compile

@@ -77,8 +77,8 @@ class Graph:
         return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)
 
     def input(self, name: str, varies: bool) -> int:
-        """Return the node of an input: a parameter or, with `varies`, time, a coordinate, speed or
-        scene input.
+        """Return the node of an input. If it `varies`, it is time, a coordinate, a speed or an input of the
+        scene; otherwise it is a parameter.
         """
         return self._node("input", (), name, varies)
 

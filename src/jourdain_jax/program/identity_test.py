@@ -173,8 +173,8 @@ def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Return which rows of `a` and `b`, values at generic probes, are equal up to round-off at the `regular`
-    probes.
+    """Return which rows of `a` and `b` are equal up to round-off at the `regular` probes. A row contains the
+    values of one number at all generic probes.
     """
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
@@ -190,8 +190,8 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-    """Return the entries of `replacement` (node -> substitute) that, each alone, change no value of `nodes`
-    at generic `probes`.
+    """Return the entries of `replacement` (node -> substitute) that change no value of `nodes` at generic
+    `probes`. Each entry is tried alone.
     """
     graph, here = probes.graph, probes(nodes)
 

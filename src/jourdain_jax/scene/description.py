@@ -144,8 +144,8 @@ def _misspelt(kind: type, base: type) -> str:
 
 
 def _check_counts(scene) -> None:
-    """Raise ValueError for an integer field that is neither static nor a parameter: traced, it could not
-    count the turns of a loop.
+    """Raise ValueError for an integer field that is neither static nor a parameter. JAX would trace the
+    field, and a traced number cannot be the number of iterations of a loop.
     """
     for field in fields(scene):
         value, known = getattr(scene, field.name), field.metadata

@@ -127,8 +127,8 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
     for name in names:
         if name not in scene.switching.contacts:
             raise ValueError(
-                f"the friction of `{name}` of `{_name(scene)}` is given outside the method `{method}`; use "
-                f"`{word}` in that method"
+                f"`{name}` of `{_name(scene)}` had no friction when the scene was made; use `{word}` in "
+                f"`{method}` for every state"
             )
 
 
@@ -151,8 +151,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
         )
         if (contact.friction is not None) != (name in scene.switching.contacts):
             raise ValueError(
-                f"the friction of contact `{name}` of `{_name(scene)}` is given outside the method "
-                "`contacts`; use `friction=` in that method"
+                f"contact `{name}` of `{_name(scene)}` gained or lost its friction after the scene was made; "
+                "use `friction=` in `contacts` for every state or for none"
             )
     return contacts
 

@@ -290,8 +290,8 @@ def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
     if is_traced(closed.consts):
         raise ValueError(
             f"a method of `{type(scene).__name__}`, or a function that it calls, reads a number that JAX is "
-            "tracing (jit, grad, vmap) and that is not a field of the scene; make it one, `name: float = "
-            "jj.parameter(unit=...)`, and pass it to the scene"
+            "tracing (jit, grad, vmap) and that is not a field of the scene; declare a field `name: float = "
+            "jj.parameter(unit=...)`, and pass the number to the scene"
         )
     return needed_only(closed), shape
 

@@ -49,8 +49,8 @@ def sampled(
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
     if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
         raise ValueError(
-            f"the quantity of an output is {described(values)}, expected its real values at all "
-            f"{times.shape[0]} times of the motion"
+            f"the quantity of an output is {described(values)}, expected real numbers of shape "
+            f"({times.shape[0]},), one for each time of the motion"
         )
     return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 

@@ -88,6 +88,6 @@ def check_disk(path, need: float) -> None:
     if need > free:
         raise ValueError(
             f"the results take {need / 1e9:,.1f} GB, and the disk of `{path}` has {free / 1e9:,.1f} GB free; "
-            "take fewer samples, fewer outputs or a larger `keep_every`, save='statistics', or shares "
-            "(`shard`) on several disks"
+            "take fewer samples or outputs, a larger `keep_every` or save='statistics', or divide the study "
+            "among several disks (`shard`)"
         )

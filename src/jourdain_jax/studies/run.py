@@ -39,7 +39,7 @@ PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr"
 @dataclass(frozen=True)
 class Lanes:
     """Results of a block of samples: the stored values by column, the ends of motions by the names of
-    `OF_LANES`, and all outputs (samples, outputs).
+    `OF_LANES`, and all outputs as an array of shape (samples, outputs).
 
     Ends and outputs are on the device, and may be padded.
     """

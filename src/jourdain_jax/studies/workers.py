@@ -104,12 +104,12 @@ def whatever_dies(
             if deaths == attempts:
                 left_out.append(number)
                 if store.read_grid() is None:
-                    raise RuntimeError(f"{_died(store, [0])}, with which every process begins. {_ADVICE}")
+                    raise RuntimeError(f"{_died(store, [0])}; every process computes these first. {_ADVICE}")
         waiting = [number for number in waiting if number not in left_out and store.receipt(number) is None]
     if left_out:
         said = (
-            f"{_died(store, sorted(left_out))}, which are omitted; all others are stored, and the same call "
-            f"tries these again. {_ADVICE}"
+            f"{_died(store, sorted(left_out))}; these samples are omitted; all others are stored, and the "
+            f"same call tries the omitted ones again. {_ADVICE}"
         )
         warn(said)
 

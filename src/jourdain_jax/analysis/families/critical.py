@@ -367,8 +367,8 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
             raise ValueError(
-                f"the steady motions for these parameters form a set of {freedoms.shape[1]} dimensions, "
-                "where a zero eigenvalue is not a special point; name further values in `held`"
+                f"the steady motions for these parameters form a set of {freedoms.shape[1]} dimensions, but "
+                "`critical` follows a zero eigenvalue only on a curve; choose a point of another kind"
             )
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]

@@ -118,8 +118,8 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
 
 
 def _left(equations: Motions, point: Point) -> str | None:
-    """Return why a curve ends before a point: a parameter would have the wrong sign there. None if it would
-    not.
+    """Return which parameter would have a forbidden sign at a point, so that the curve ends before it; None
+    if all signs are allowed.
     """
     values = equations.values(point.z)
     for name, _, declared in parameters_of(equations.scene):

@@ -3,7 +3,7 @@ start, and sampled inputs.
 
     value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 
-`Reading` and `Drive` are the sensors and actuators of one run, with numbers in place of estimates.
+`Reading` and `Drive` are the sensors and actuators of one run, with a value in place of each estimate.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ Numbers = Float[Entries, "..."]
 
 
 class Response(eqx.Module):
-    """The numbers of a sensor or actuator of one run; estimated numbers have their first guesses."""
+    """The parameters of a sensor or actuator of one run; estimated ones have their first guesses."""
 
     numbers: dict[str, Numbers | float]
     unknown: Labels = static()  # names of estimated numbers
@@ -120,7 +120,7 @@ class Drive(Response):
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, Labels, Labels]:
-    """Return the numbers of a sensor or actuator (first guesses of estimated ones), the names of estimated
+    """Return the parameters of a sensor or actuator (first guesses of estimated ones), the names of estimated
     numbers, and the names of all numbers that have an effect.
     """
     given = {name: getattr(owner, name) for name in NUMBERS}
@@ -193,7 +193,7 @@ class Experiment(eqx.Module):
     inputs: dict | Inputs | None
     sensors: dict[str, Sensor]
     readings: dict[str, Reading]  # prepared sensors; `checked` fills this and the next two fields
-    drives: dict[str, Drive]  # actuators with estimated numbers, by input
+    drives: dict[str, Drive]  # actuators with estimated parameters, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Entries, ""]  # s
     # s, of channels with correlated noise; zero if it is estimated
@@ -266,8 +266,8 @@ class Experiment(eqx.Module):
             )
         if not self.values:
             raise ValueError(
-                "`values` is empty; give at least one channel: name -> measured values; or the "
-                "time of an event, in `events`"
+                "`values` is empty; give the measured values of at least one channel by name, or in `events` "
+                "the time of an event"
             )
         for names, what, known in (
             (self.sigma, "`sigma` names channel `{}`, which has no values", self.values),

@@ -126,7 +126,7 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
 
 
 def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
-    """Return all inputs at the first guesses, and the actuators with estimated numbers."""
+    """Return all inputs at the first guesses, and the actuators with estimated parameters."""
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}
@@ -314,7 +314,7 @@ def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Exp
 
 
 def check_known(runs: Sequence[Experiment], what: str) -> None:
-    """Raise ValueError if a sigma, or a number of a sensor or an actuator, is unknown."""
+    """Raise ValueError if a sigma, or a parameter of a sensor or actuator, is unknown."""
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(

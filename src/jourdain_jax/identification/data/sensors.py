@@ -183,5 +183,5 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
 
 
 def default_range(name: str):
-    """Return the default range of an estimated number of a sensor or actuator."""
+    """Return the default range of an estimated parameter of a sensor or actuator."""
     return positive() if name == "lag" else unbounded()

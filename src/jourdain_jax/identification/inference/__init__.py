@@ -1,4 +1,4 @@
-"""Uncertainty of a fit, and densities of the same runs.
+"""Uncertainty of a fit, and probability densities of its runs.
 
     information, planned_information    covariance of a fit, and of a plan
     standard_errors                     intervals, and sigmas that are estimated

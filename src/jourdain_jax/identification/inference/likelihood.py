@@ -64,10 +64,10 @@ def log_likelihood(
     """Return the logarithm of the probability density of the measurements `data` (one run or several): `- sum
     r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
-    The result is differentiable with respect to the scene, start values, measured values, sigmas, numbers of
-    sensors and actuators (reverse mode, unless `adjoint` requests another) and known correlation times of the
-    noise. It is -inf if the motion fails. Missing samples (NaN, or an infinite sigma) are omitted. `options`,
-    `by_name`: as in `simulate`.
+    The result is differentiable with respect to the scene, start values, measured values, sigmas, parameters
+    of sensors and actuators, and known correlation times of the noise (by reverse mode, unless `adjoint`
+    requests another). It is -inf if the motion fails. Missing samples (NaN, or an infinite sigma) are
+    omitted. `options`, `by_name`: as in `simulate`.
 
         jax.grad(lambda a: jj.identification.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 

@@ -267,7 +267,7 @@ def log_density(
     **Arguments**
 
     - `scene`, `data`, `free`, `options`, `by_name`: as in `fit`. Unknowns are free parameters, unknown start
-      values, estimated numbers of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
+      values, estimated parameters of sensors and actuators, and sigmas that are None, named `"lean.sigma"`.
     - Priors: `Normal` if an `Estimate` has one. Otherwise the prior is flat between bounds: in the unknown
       itself, and in the logarithm of a sigma. For a correlation time tau it is flat in arcsin(exp(-h / tau)),
       where h is the shortest interval between samples of the channel. A flat prior without bounds cannot be

@@ -124,8 +124,8 @@ def planned_information(
 
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and
       sensors. Their `values` have no effect; NaN marks a missing sample.
-    - `free`, `options`, `by_name`: as in `fit`. Start values in `unknown_start` and estimated numbers of
-      sensors are unknowns, too. Priors are included.
+    - `free`, `options`, `by_name`: as in `fit`. Start values in `unknown_start` and estimated sensor
+      parameters are unknowns, too. Priors are included.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with
     respect to parameters, start values and samples of inputs in forward mode (`jax.jacfwd`), also under

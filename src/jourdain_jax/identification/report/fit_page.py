@@ -153,7 +153,7 @@ def fit_page(
     if held_out:
         about = (
             "These runs were not fitted. Shared unknowns are fixed at their estimates; unknown start values, "
-            "and each run's numbers of sensors, are fitted to the run itself."
+            "and each run's sensor parameters, are fitted to the run itself."
         )
         sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
     sections += [_whiteness(fit, fitted), _way(fit)]

@@ -47,9 +47,9 @@ class Fit(Estimates):
         profile has the range within which 2 (F - F_min) stays below 3.84 when all other unknowns are fitted
         again, and its kind: "bounded", "one-sided" or "flat". `data`: the runs of the fit.
 
-        This takes some ten fits per name. For estimated sigmas, a robust loss or errors="runs", the rise is
-        scaled accordingly. Raises ValueError for a batch, a failed fit, and other data than the fit's;
-        KeyError for names that were not estimated.
+        This takes some ten fits per name. For estimated sigmas, a robust loss or errors="runs", 2 (F - F_min)
+        is first divided by a factor, so that the range widens as the interval does. Raises ValueError for a
+        batch, a failed fit, and other data than the fit's; KeyError for names that were not estimated.
         """
         self._check_one()
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
@@ -64,9 +64,9 @@ class Fit(Estimates):
         """Return predictions for `runs` that were not fitted: for each run a dictionary by channel with
         `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
-        Shared unknowns keep their estimates; unknown start values, and the numbers of each run's sensors, are
-        fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit the
-        scene or whose motion fails.
+        Shared unknowns keep their estimates. Unknown start values and unknown sensor parameters of each run
+        are fitted to that run. Raises ValueError for a batch or a failed fit, and for runs that do not fit
+        the scene or whose motion fails.
         """
         self._check_one()
         return of_held_out(self, runs)
@@ -123,7 +123,8 @@ class Fit(Estimates):
 
         - `data`: the fitted runs.
         - `z`: draws of a sampler, shape (chains, draws, unknowns), for `log_density(...).whitened(fit)`;
-          default: four chains of 1000 standard normal draws, which is the approximation of this fit.
+          default: four chains of 1000 standard normal draws, that is, draws from the normal approximation
+          of the posterior at this fit.
 
         Raises ImportError without ArviZ; ValueError for a batch, a failed fit, a robust loss, and unknowns
         without a standard error.

@@ -5,7 +5,7 @@ Predictions for other runs:
     error = prediction - value,   rms^2 = mean error^2,   R^2 = 1 - sum error^2 / sum (value - mean)^2
 
 Means and sums are over all available samples of a channel. Shared unknowns are held at their estimates.
-Unknowns of a run (start values, numbers of its sensors) are fitted to that run.
+Unknowns of a run (start values, sensor parameters) are fitted to that run.
 
 The share of each sample in the information on an unknown:
 
@@ -19,11 +19,11 @@ Regression (1982), section 2.2.
 
 Profile likelihood: the objective as a function of one unknown, minimised over all others.
 
-    rise(x) = 2 min (F - F_min) / inflation       over all unknowns but one, held at x
+    rise(x) = 2 min (F - F_min) / f       over all unknowns but one, held at x
     interval: where rise(x) <= 3.841, the 95 % quantile of chi-square with one degree of freedom
 
-inflation: as in the covariance, for the loss and for estimated sigmas. A profile is bounded if both ends
-exist, one-sided if only one exists, and flat if none exists, so that the data do not determine the unknown.
+f: correction for the loss and for estimated sigmas (`standard_errors.py`). A profile is bounded if both ends
+exist, one-sided if only one exists, and flat if none exists: then the data do not determine the unknown.
 The fit at each point starts from the solution at its inner neighbour. Correlation times are held. Source: D.
 J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; A. Raue et al., Bioinformatics 25 (2009)
 1923.
@@ -283,10 +283,10 @@ def profiles(
     fitted: Minimum,
     names: Iterable[str],
     errors: dict[str, float],
-    inflation: dict[str, float],
+    divisors: dict[str, float],
 ) -> dict[str, Profile]:
     """Return profiles of the named unknowns. `errors`: standard errors by name, for the first step;
-    `inflation`: divisor of the rise.
+    `divisors`: f of the module's formula by name.
     """
     unknowns, found = problem.unknowns, {}
     for name in names:
@@ -299,12 +299,12 @@ def profiles(
         else:
             first = 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
         low, high = (
-            side(problem, fitted, 0, place, way, first, RISE_95 / 2 * inflation[name]) for way in (-1.0, 1.0)
+            side(problem, fitted, 0, place, way, first, RISE_95 / 2 * divisors[name]) for way in (-1.0, 1.0)
         )
         values, rise = np.array(sorted({(estimate, 0.0), *low.points, *high.points})).T
         closed = low.is_closed, high.is_closed
         kind = ("flat", "one-sided", "bounded")[sum(closed)]
         notes = tuple(dict.fromkeys(one.note for one in (low, high) if one.note))
-        unit, rise = unknowns.units[k], 2 * rise / inflation[name]
+        unit, rise = unknowns.units[k], 2 * rise / divisors[name]
         found[name] = Profile(name, unit, estimate, values, rise, low.end, high.end, closed, kind, notes)
     return found

@@ -138,7 +138,7 @@ class BodyInertia:
 
 def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
     """Return the parameters of the named body's inertia. Raises ValueError if there is no such body, or if
-    its inertia has another form.
+    its inertia matrix is not built from parameters as `possible_inertia` requires.
     """
     diagonal, products = _found(scene, name)
     axes: list[int] = []

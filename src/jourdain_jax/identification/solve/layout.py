@@ -19,13 +19,13 @@ from jourdain_jax.identification.solve.body_inertia import BodyInertia, Tie
 from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.scene import Scene
 
-# parameter; inertia of a body; initial value; number of a sensor or an actuator
+# parameter; inertia of a body; initial value; parameter of a sensor or actuator
 Kind = Literal["scene", "inertia", "start", "sensor"]
 
 
 @dataclass(frozen=True)
 class Place:
-    """The range that a parameter, an initial value, or a number of a sensor or actuator occupies in a vector
+    """The range that a parameter, an initial value, or a sensor or actuator parameter occupies in a vector
     of unknowns.
     """
 
@@ -106,11 +106,11 @@ class Layout:
 
     @property
     def numbers(self) -> bool:
-        """Return whether sensors or actuators have unknown numbers."""
+        """Return whether sensors or actuators have unknown parameters."""
         return any(place.kind == "sensor" for place in (*self.shared, *self.local))
 
     def known(self, *vectors) -> dict[str, Array | np.ndarray]:
-        """Return the unknown numbers of sensors and actuators of one run, by name."""
+        """Return the unknown parameters of sensors and actuators of one run, by name."""
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:

@@ -85,8 +85,8 @@ class Minimum(ByMember):
 
     @staticmethod
     def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
-        """Return the state before the first step. Members whose motion fails do not run. `what`: the name of
-        the objective in the trace.
+        """Return the state before the first step. Members whose motion fails at `theta` take no steps.
+        `what`: the name of the objective in the trace.
         """
         none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
         trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
@@ -293,14 +293,14 @@ class Loss:
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
     def bend(self, r: Residuals) -> float:
-        """Return the ratio of the inverse second derivative of F to (J'WJ)^-1; infinite if F is not convex in
-        the residuals.
+        """Return `mean(w) / mean(rho'')` over the residuals, the factor from `(J'WJ)^-1` to the inverse of
+        the second derivative of F with respect to the unknowns; infinite unless `mean(rho'') > 0`.
         """
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
 
     def _slope(self, r: Residuals) -> Residuals:
-        """Return psi', the second derivative of rho."""
+        """Return `psi' = rho''`, the second derivative of the loss."""
         k = self.parameter
         if self.kind == "student-t":
             return (k + 1) * (k - r**2) / (k + r**2) ** 2

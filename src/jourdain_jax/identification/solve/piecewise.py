@@ -86,7 +86,7 @@ class Piecewise(Problem):
         )  # index of the run of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
-        # a piece has the sensor numbers of the previous piece, whose end state is its node
+        # a piece starts at the end state of the previous piece, with the same sensor parameters
         self._carried = np.array(
             [k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)],
             int,
@@ -125,7 +125,7 @@ class Piecewise(Problem):
 
     def _each(self, of_runs: np.ndarray, later, first_node, later_node, carried: bool = True) -> np.ndarray:
         """Return the unknowns of all pieces from the unknowns of whole runs. `later`: the start values of
-        later pieces; `carried`: whether shared sensor numbers are copied to all pieces.
+        later pieces; `carried`: whether shared sensor parameters are copied to all pieces.
         """
         shared, own = self.unknowns.split(of_runs)
         own = own[..., self.run_of, :]

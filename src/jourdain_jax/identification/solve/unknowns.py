@@ -1,4 +1,4 @@
-"""The unknowns of a fit: shared parameters of the scene, initial values of single runs, and numbers of
+"""The unknowns of a fit: shared parameters of the scene, initial values of single runs, and parameters of
 sensors and actuators.
 
     theta = (shared, own of run 0, own of run 1, ...)

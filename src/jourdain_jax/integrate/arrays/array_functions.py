@@ -167,7 +167,7 @@ class Functions:
         self._store(pushed(self._projected, self._parts(state, t, y)), y, self.count)
 
     def along(self, state: Pointer, t, y: Pointer) -> None:
-        """Project an error, stored after its state, onto the directions that the constraints allow."""
+        """Project an error onto the directions that the constraints allow. Its rows follow the state's."""
         at, error = self.w.load(y, self.y), self.w.load(y, self.y + self.count)
         self.w.store(
             jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1],

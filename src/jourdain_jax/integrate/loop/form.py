@@ -123,8 +123,8 @@ class Form:
         ]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
-        """Split `variables` into the nodes of fixed values, of time, of the state without work, and of
-        inputs.
+        """Split `variables` into the nodes of fixed values, of time, of coordinates and integrated speeds,
+        and of inputs.
         """
         t = len(self.program.fixed)
         end = t + 1 + self.q_and_v

@@ -132,15 +132,15 @@ class Lanes:
             self.w.store(value, self.pointer, row)
 
     def place(self, name: str, lane: Number) -> Number:
-        """Return a pointer to the number of one lane in the first row with this name."""
+        """Return a pointer to the value of one lane in the first row with this name."""
         return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
     def of(self, name: str, lane: Number, type: str = "double") -> Number:
-        """Return the number of one lane in the first row with this name."""
+        """Return the value of one lane in the first row with this name."""
         return self.w.load(self.place(name, lane), type=type)
 
     def set(self, name: str, lane: Number, value) -> None:
-        """Set the number of one lane in the first row with this name."""
+        """Set the value of one lane in the first row with this name."""
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 

@@ -187,7 +187,7 @@ def begin_lane(
 def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple[range, OfLane]]:
     """Return the rows of a lane's start as contiguous ranges, each with its source in memory.
 
-    On a GPU, shared numbers that steps do not change are not copied, and hence omitted.
+    On a GPU, numbers that all samples share and no step changes are read in place, so they are omitted.
     """
     count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
     found, shared = [], w.common if w.device else [False] * form.given

@@ -43,7 +43,7 @@ class UsualLengths(eqx.Module):
 
 def usual_lengths(scene: Scene) -> UsualLengths:
     """Return the typical lengths for the parameters of `scene`. They have no derivatives."""
-    with jax.ensure_compile_time_eval():  # the results are cached, so they must be concrete also inside `jit`
+    with jax.ensure_compile_time_eval():  # the results are cached, so they must be concrete even inside `jit`
         own_speeds = _of_own_speeds(scene)
         if not is_traced(scene):
             return UsualLengths(
@@ -212,8 +212,8 @@ class FullByMatrices(ByMatrices):
 
     @property
     def has_pivots(self) -> bool:
-        """Return whether the motion might change to another branch, so that pivots or directions are
-        monitored.
+        """Return whether pivots or directions are monitored, because the motion might change to another
+        branch.
         """
         return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 

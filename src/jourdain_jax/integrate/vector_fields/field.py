@@ -248,8 +248,8 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
-        """Return all speeds, and a pivot: a measure of how well the independent speeds determine the others,
-        which changes its sign where they do not.
+        """Return all speeds, and a pivot that measures how well the independent speeds determine the others.
+        Where they cease to determine them, the pivot passes through zero and changes its sign.
 
         For the full state it is the pivot of the reduction, without a sign. It is None if no speed is
         eliminated.

@@ -13,8 +13,8 @@ earlier versions have none).
 `kind` is "trajectory" or "rollout". In a rollout every array has a leading batch axis: `result` has one code
 per sample. `reruns` in the header describes how samples with a `fallback` were retried.
 
-Loading raises an error if the digest does not match, that is, if the file is damaged or was changed, and if
-the names, the parameters or their units differ from those of the scene's class.
+Loading raises an error if the digest does not match (the file is damaged or was changed), or if names,
+parameters or units in the file differ from those of the scene's class.
 """
 
 import hashlib
@@ -261,7 +261,7 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
 
 
 def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the input samples at the reached times, in order of increasing time also for reversed time."""
+    """Return the input samples at the reached times, in order of increasing time even for reversed time."""
     reached = np.flatnonzero(np.isfinite(ts))
     times, first = np.unique(ts[reached], return_index=True)
     return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))

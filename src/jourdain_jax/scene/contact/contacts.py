@@ -303,7 +303,7 @@ def _slipping(
         return None, None, impact
     if height != "row":
         raise ValueError(
-            f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the '
+            f'a contact with friction may lift off, but with height="coordinates" `{body}` cannot leave the '
             'ground; give the body a coordinate for its height, and write height="row"'
         )
     known = isinstance(friction, Coulomb)
