@@ -37,13 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "jourdain_jax"
 SOURCE = ROOT / "src" / PACKAGE
 FOLDERS = ("src", "tests", "bench", "docs", "notebooks")
-PUBLIC = {
-    PACKAGE,
-    *(
-        f"{PACKAGE}.{name}"
-        for name in ("models", "bicycle", "bicycle.parameters", "bicycle.readings", "cli", "dynamics.reduced")
-    ),
-}
+PUBLIC = {PACKAGE, *(f"{PACKAGE}.{name}" for name in ("models", "bicycle", "cli", "dynamics.reduced"))}
 PUBLIC |= {f"{PACKAGE}.{name}" for name in ("analysis", "equations", "identification", "studies")}
 # below public names, tests may speak to the scalar program and its operations, also as machine code, and to
 # one step

@@ -23,8 +23,7 @@ import numpy as np
 from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
-from jourdain_jax.bicycle import eigenvalues, linear_matrices, measured_bicycle, stability_speeds
-from jourdain_jax.bicycle.parameters import PARAMETERS
+from jourdain_jax.bicycle import PARAMETERS, eigenvalues, linear_matrices, measured_bicycle, stability_speeds
 from jourdain_jax.studies import Design, EventTime, Happened, Normal, Uniform, sobol_indices
 
 matplotlib.use("Agg")

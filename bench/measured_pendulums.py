@@ -13,6 +13,7 @@ import numpy as np
 from figures import Figures, figure, main
 
 from jourdain_jax.bicycle import (
+    PARAMETER_NAMES,
     benchmark_from_measurements,
     interval,
     linear_matrices,
@@ -22,7 +23,6 @@ from jourdain_jax.bicycle import (
     shipped_measurements,
     stability_speeds,
 )
-from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")  # published as means over pairs of lines
 ROUNDED = ("Balanceassistv1",)  # its file gives two or three digits

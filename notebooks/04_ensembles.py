@@ -202,7 +202,7 @@ print(f"weave speed {np.nanmean(weave):.2f} +- {np.nanstd(weave):.2f} m/s")
 order = np.argsort(-of_weave.total)[:8]
 
 # %%
-from jourdain_jax.bicycle.parameters import PARAMETERS
+from jourdain_jax.bicycle import PARAMETERS
 
 figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
 axis.barh(

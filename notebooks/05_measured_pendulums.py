@@ -27,16 +27,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jourdain_jax.bicycle import (
+    PARAMETER_NAMES,
     benchmark_from_measurements,
     interval,
     linear_matrices,
     measured_bicycle,
+    read_readings,
     sample_parameters,
     shipped_measurements,
 )
 from jourdain_jax.bicycle import stability_speeds as speeds_of_matrices
-from jourdain_jax.bicycle.measurements import read_readings
-from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 
 # %% [markdown]
 # ## Readings

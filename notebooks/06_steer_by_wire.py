@@ -34,10 +34,9 @@ import numpy as np
 import scipy.optimize
 
 import jourdain_jax as jj
-from jourdain_jax.bicycle import linear_matrices
-from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+from jourdain_jax.bicycle import PARAMETER_NAMES, linear_matrices
 from jourdain_jax.identification import Actuator, Sensor, unbounded
-from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.models import WhippleBicycle
 from jourdain_jax.studies import Normal
 
 with gzip.open(Path("data/steer_by_wire/windows.csv.gz"), "rt") as file:

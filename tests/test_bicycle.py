@@ -14,12 +14,15 @@ from oracles.hang_lines import mean_of_intersections
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import (
+    PARAMETER_NAMES,
+    PARAMETERS,
     Refused,
     benchmark_from_measurements,
     eigenvalues,
     interval,
     measured_bicycle,
     read_bicycle,
+    read_readings,
     run,
     sample_parameters,
     shipped_bicycles,
@@ -29,8 +32,6 @@ from jourdain_jax.bicycle import (
     table,
     write_results,
 )
-from jourdain_jax.bicycle.measurements import read_readings
-from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
 from jourdain_jax.cli import main
 from jourdain_jax.cli.bicycle_verbs import prefixes
 

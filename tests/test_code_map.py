@@ -15,9 +15,9 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 472_128,
+    "code tokens of src": 472_146,
     "code tokens of docs": 13_475,
-    "code tokens of notebooks": 7453,
+    "code tokens of notebooks": 7431,
     "caches": 50,
     "named numbers": 299,
     "tests for a tracer": 60,
@@ -27,8 +27,8 @@ CEILINGS = {
     "ways: constraints and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, its event search and its adjoint": 1,
-    "code tokens of tests": 337_211,
-    "code tokens of bench": 108_081,
+    "code tokens of tests": 337_193,
+    "code tokens of bench": 108_064,
     "test files that reach private names": 34,
 }
 

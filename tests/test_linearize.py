@@ -14,8 +14,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import linearize
-from jourdain_jax.bicycle import linear_matrices, measured_bicycle, stability_speeds
-from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+from jourdain_jax.bicycle import PARAMETER_NAMES, linear_matrices, measured_bicycle, stability_speeds
 from jourdain_jax.equations import potential_energy, unconstrained_equations
 from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, WhippleBicycle
 from jourdain_jax.studies import Normal

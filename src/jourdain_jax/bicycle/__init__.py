@@ -1,7 +1,7 @@
 """Measured bicycles: parameter files and raw measurements, linear stability and its uncertainty, rides."""
 
 from jourdain_jax.bicycle.job import Refused, Study, run, study, table, write_results
-from jourdain_jax.bicycle.measurements import benchmark_from_measurements
+from jourdain_jax.bicycle.measurements import benchmark_from_measurements, read_readings
 from jourdain_jax.bicycle.parameter_files import (
     MeasuredBicycle,
     measured_bicycle,
@@ -9,6 +9,7 @@ from jourdain_jax.bicycle.parameter_files import (
     shipped_bicycles,
     shipped_measurements,
 )
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
 from jourdain_jax.bicycle.stability import (
     Interval,
     ParameterSamples,
@@ -22,6 +23,8 @@ from jourdain_jax.bicycle.stability import (
 )
 
 __all__ = [
+    "PARAMETERS",
+    "PARAMETER_NAMES",
     "Interval",
     "MeasuredBicycle",
     "ParameterSamples",
@@ -34,6 +37,7 @@ __all__ = [
     "linear_matrices",
     "measured_bicycle",
     "read_bicycle",
+    "read_readings",
     "run",
     "sample_parameters",
     "shipped_bicycles",
