@@ -40,7 +40,7 @@ Both = tuple[np.ndarray, np.ndarray]
 
 
 class RowsOverStates:
-    """Constraints and coordinate rates of a scene as functions of points x = (t, q)."""
+    """Constraints and coordinate rates of a scene as functions of points `x = (t, q)`."""
 
     def __init__(self, scene: Scene):
         self.scene, self.traced = scene, traced_scene(scene)
@@ -130,7 +130,7 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
 
 def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.ndarray) -> float:
     """Return the largest value of dw on unit velocities that w admits, divided by the size of w and of its
-    derivatives. The form w is given by w F = a; the last axis of `da` and `dF` counts directions in (t, q).
+    derivatives. The form w is given by `w F = a`; the last axis of `da` and `dF` counts directions in (t, q).
 
     dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x) for fields X = F x, Y = F y with constant x and y
     """

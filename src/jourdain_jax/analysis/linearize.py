@@ -65,8 +65,8 @@ class Modes(eqx.Module):
 class Linearization(Printed, eqx.Module):
     """Linear equations of small motions about a state.
 
-    x = (independent coordinates, independent speeds): dx/dt = A x + B f. For the named coordinates p:
-    M pddot + C pdot + K p = F f.
+    x = (independent coordinates, independent speeds): `dx/dt = A x + B f`. For the named coordinates p:
+    `M pddot + C pdot + K p = F f`.
     """
 
     A: Float[Array, "states states"]
@@ -162,7 +162,7 @@ class Linearization(Printed, eqx.Module):
         return _roots(self.A)
 
     def state_space(self, outputs: Outputs = None) -> StateSpace:
-        """Return the model dx/dt = A x + B f, y = C x + D f with the named outputs y.
+        """Return the model `dx/dt = A x + B f`, `y = C x + D f` with the named outputs y.
 
             small.state_space("lean yaw_rate")
             small.state_space({"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))[1]})

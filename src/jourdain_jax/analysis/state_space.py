@@ -27,7 +27,7 @@ Outputs = str | Labels | list[str] | Mapping[str, Callable[[Any], Any]] | None
 
 
 class StateSpace(Printed, eqx.Module):
-    """Linear model dx/dt = A x + B f, y = C x + D f of deviations from a motion.
+    """Linear model `dx/dt = A x + B f, y = C x + D f` of deviations from a motion.
 
         model = jj.linearize(scene, state).minimal()
         gains, _, poles = control.lqr(model.to_control(), Q, R)
@@ -137,7 +137,7 @@ def largest_of(x: np.ndarray) -> float:
 def _controllable(
     A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n inputs"], cutoff: float
 ) -> Float[np.ndarray, "n controllable"]:
-    """Return an orthonormal basis of the span of B, A B, A^2 B, ..., extended by the new directions of each
+    """Return an orthonormal basis of the span of `B, A B, A^2 B, ...`, extended by the new directions of each
     product.
     """
     basis, new, size = np.zeros((len(A), 0)), B, largest_of(B)

@@ -19,7 +19,7 @@ Files of raw measurements of a bicycle, `name = reading+/-sigma, reading+/-sigma
 masses, angles and periods of its parts.
 
 Format of BicycleParameters (Moore, Hubbard & Kooijman), files `*Measured.txt`. n readings of one quantity are
-replaced by their mean, with the standard deviation sqrt(sum sigma^2) / n. A name consists of quantity, part
+replaced by their mean, with the standard deviation `sqrt(sum sigma^2) / n`. A name consists of quantity, part
 and number: `TtB2` is the twisting period of the rear frame B in its second hanging.
 
 | name | reading | unit |

@@ -52,13 +52,13 @@ def passing_cutoff(dtype: jnp.dtype) -> float:
     """Return the relative cutoff for motions *through* a loss of rank: sqrt(eps) of `dtype`.
 
     Round-off e in a row of size sigma causes a velocity e/sigma and an acceleration e/sigma^2; adaptive steps
-    resolve these down to sigma of about sqrt(e).
+    resolve these down to sigma of about `sqrt(e)`.
     """
     return max(rank_cutoff(dtype), float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def undecided(dtype: jnp.dtype) -> float:
-    """Return the relative row size below which round-off decides the branch of a motion: 8 sqrt(eps) of
+    """Return the relative row size below which round-off decides the branch of a motion: `8 sqrt(eps)` of
     `dtype`.
 
     Round-off e turns two crossing branches of g = 0 into the hyperbola g = e. Within about sqrt(e) of the

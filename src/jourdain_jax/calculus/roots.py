@@ -50,7 +50,7 @@ def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
     """Return x with `residual(x) = 0` near `guess`; `residual` may close over traced numbers.
 
     `scale`: size of each unknown; infinite for an unknown to ignore. The iteration stops when the corrections
-    no longer shrink. It has converged if they are then at most eps^0.6 times the sizes.
+    no longer shrink. It has converged if they are then at most `eps^0.6` times the sizes.
     """
 
     eps = eps_of(guess)
@@ -120,7 +120,7 @@ def damped_search(
     """Search from `guess`, between `low` and `high`, for x whose residuals f are at most `tolerance`. Return
     the best x, its f, and J in units of `size`.
 
-    `rows`: function from x to f and J = df/dx. `size`: unit of the steps of each unknown, zero for a fixed
+    `rows`: function from x to f and `J = df/dx`. `size`: unit of the steps of each unknown, zero for a fixed
     one. Scale f so that a change of an unknown by its size changes f by about one.
     """
 
@@ -297,7 +297,7 @@ def nearest_root(
     1 + |x|, which are infinite for NaN.
 
     `look`: function from x and state indices to g and G. `solve`: function from G and g to the shortest d
-    with G d = g. No entry of a step exceeds `longest`, and x stays within the bounds `within`.
+    with `G d = g`. No entry of a step exceeds `longest`, and x stays within the bounds `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):
@@ -317,7 +317,7 @@ def nearest_root(
 
 
 def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return the shortest d with G d = g at every state. If rows are nearly dependent, or shorter than
+    """Return the shortest d with `G d = g` at every state. If rows are nearly dependent, or shorter than
     `typical`, return a least-squares solution.
     """
     return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]

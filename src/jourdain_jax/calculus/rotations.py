@@ -116,7 +116,7 @@ def quaternion_to_matrix(quaternion: Real[Entries, "4"] | Sequence[Number]) -> M
 def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Float[np.ndarray, "matrices 4"]:
     """Return unit quaternions (w, x, y, z), with either sign, of concrete rotation matrices, body to space.
 
-    The diagonal gives the largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2. The other components are sums and
+    The diagonal gives the largest of `4 w^2, 4 x^2, 4 y^2, 4 z^2`. The other components are sums and
     differences of entries, divided by the root of that largest number (Shepperd 1978).
     """
     R = np.asarray(rotations, float)

@@ -82,7 +82,7 @@ def wave(function: Callable) -> Callable:
 
 
 def tangent(x):
-    """Return tan a with its bound; its derivative is 1 + tan(a)^2."""
+    """Return tan a with its bound; its derivative is `1 + tan(a)^2`."""
     a, ea = halves(x)
     value = np.tan(a)
     return with_bound(value, 2 * (1 + value**2) * ea)

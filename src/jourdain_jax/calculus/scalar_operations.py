@@ -65,15 +65,15 @@ def _smaller(g, n, a, b, da, db):
 
 
 def _halved_where_equal(g, a, b, otherwise, da, db):
-    """Return the mean of both derivatives where the arguments are equal, as JAX does: max(x, 0) - max(-x, 0)
-    is smooth at x = 0.
+    """Return the mean of both derivatives where the arguments are equal, as JAX does. Thus `max(x, 0) -
+    max(-x, 0)` is smooth at x = 0.
     """
     return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
 
 
 def _real_power(g, n, a, b, da, db):
-    """Return (a^b)' = b a^(b-1) a' + a^b log(a) b'. The first term is zero where a and b are zero, the second
-    where a is zero (a^b log a -> 0 for b > 0).
+    """Return `(a^b)' = b a^(b-1) a' + a^b log(a) b'`. The first term is zero where a and b are zero, the
+    second where a is zero (`a^b log a` tends to 0 for b > 0).
     """
     of_base, of_exponent = g.zero, g.zero
     if da != g.zero:

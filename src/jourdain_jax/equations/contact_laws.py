@@ -130,7 +130,7 @@ class Solution(NamedTuple):
 
 @jax.jit
 def coulomb(law: Law) -> Solution:
-    """Return forces P that satisfy Coulomb's law at all contacts simultaneously, with w = G P + b.
+    """Return forces P that satisfy Coulomb's law at all contacts simultaneously, with `w = G P + b`.
 
         w_n >= target and P_n >= 0, one of them with equality;
         w_t = 0 and |P_t| <= mu_s P_n, or P_t = -mu P_n e with e = w_t/|w_t|
@@ -193,7 +193,7 @@ def _improved(law: Law, P: ContactVectors, modes: Modes) -> tuple[ContactVectors
     """Return forces and directions of slip after one step of Newton's method.
 
     The unknowns are the forces P and the angles of those directions e that are unknown. The equation of an
-    angle is n.w_t = 0, where n is e rotated by a right angle.
+    angle is `n.w_t = 0`, where n is e rotated by a right angle.
     """
     (K, s), e = system(law.G, modes, law.friction), modes.direction
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)

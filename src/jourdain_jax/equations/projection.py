@@ -160,7 +160,7 @@ def _closures(scene: Scene, t, q):
 
 
 def linearised_rows(scene: Scene, t, q, u, inputs) -> tuple[PerRow, Float[Array, "rows speeds"]]:
-    """Return phi and A = d phi/du."""
+    """Return `phi` and `A = d phi/du`."""
     phi = lambda u: velocity_residual(scene, t, q, u, inputs)
     return phi(u), jax.jacfwd(phi)(u)
 

@@ -252,7 +252,7 @@ def contact_loads(
     scene: Scene, motion: Motion, A: Float[Array, "rows speeds"], forces: PerRow
 ) -> tuple[Load, ...]:
     """Return the normal and tangential forces of the ground as loads on the bodies. Constraints with a force
-    limit give the forces A' L on the speeds.
+    limit give the forces `A' L` on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
     for i, (row, (normal, *tangential)) in enumerate(

@@ -122,7 +122,7 @@ def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | Non
 
 
 def kinetic_energy(scene: Scene, t, q, u) -> Scalar:
-    """Return T = sum m v.v/2 + omega.I omega/2 in J."""
+    """Return `T = sum m v.v/2 + omega.I omega/2` in J."""
     return _kinetic_energy(motion_at(scene, t, as_coordinates(scene, q), as_speeds(scene, u)))
 
 

@@ -43,7 +43,7 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 def combined(masses: list[Mass]) -> Mass:
     """Return the combined mass properties of several masses in one frame, by the parallel-axis theorem,
 
-    I = sum I_i + m_i (d_i.d_i - d_i d_i').
+    `I = sum I_i + m_i (d_i.d_i - d_i d_i')`.
     """
     total = sum(one.mass for one in masses)
     centre = sum(one.mass * one.centre for one in masses) / total if total else masses[0].centre

@@ -122,7 +122,7 @@ def _rates(args, t, q, v):
 
 @eqx.filter_jit
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
-    """Return H = T + V in J."""
+    """Return `H = T + V` in J."""
     field, scene, inputs, fixed, _ = args
     return sum(
         energies_at(scene, field.motion(Instant(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))))

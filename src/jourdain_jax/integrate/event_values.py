@@ -66,7 +66,7 @@ def first_event(w, before: Values, after: Values):
 
 
 def cubic(h, a, slope_a, b, slope_b) -> tuple:
-    """Return m, A, B of the cubic a + m s + A s^2 + B s^3 with given values and rates at the ends of a step
+    """Return m, A, B of the cubic `a + m s + A s^2 + B s^3` with given values and rates at the ends of a step
     h, s = 0 and s = 1.
     """
     m_0, m_1, rise = h * slope_a, h * slope_b, b - a

@@ -224,7 +224,7 @@ class Taylor(eqx.Module):
     and many saved times.
 
     y(t + s) = sum_{k=0}^p y_k s^k, where recurrences give the coefficients, in machine code of the CPU. The
-    default order is p = ceil(1 - log(rtol)/2). The length of a step keeps the last two terms within the
+    default order is `p = ceil(1 - log(rtol)/2)`. The length of a step keeps the last two terms within the
     tolerance (Jorba and Zou). Saved states are evaluated from the series, so steps need not end there.
     Compared with Dopri8 at equal error, a single Chaplygin sleigh takes half of the time at 1e-12; scenes
     with a few hundred operations take longer.
@@ -250,7 +250,7 @@ class Taylor(eqx.Module):
 
 
 def order_for(rtol: Number) -> int:
-    """Return the order p = ceil(1 - log(rtol)/2), which minimises the cost per unit of time."""
+    """Return the order `p = ceil(1 - log(rtol)/2)`, which minimises the cost per unit of time."""
     # 1e-12 is assumed for a traced tolerance
     tolerance = 1e-12 if is_traced(rtol) else float(rtol)
     return min(max(math.ceil(1 - math.log(tolerance) / 2), LEAST_ORDER), MOST_ORDER)

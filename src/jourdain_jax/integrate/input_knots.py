@@ -85,7 +85,7 @@ class SeenFromWithin(eqx.Module):
     middle: PerLane  # middle of the step, s; infinite if there is no step
 
     def __call__(self, t):
-        """Return the value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
+        """Return the value at time t, `f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)`."""
         ts, values = self.sampled.ts, self.sampled.values
         at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
         # to select the side of a knot, shift t towards the middle of the step, by 2.0**-10 of the distance

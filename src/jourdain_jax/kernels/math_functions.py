@@ -72,7 +72,7 @@ def _within(w: Writer, x: Value, low: float, high: float) -> Value:
 
 
 def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Value, Value]:
-    """Return k and the two parts of p for e^(x + more) = 2^k (1 + p). `more` is small relative to x,
+    """Return k and the two parts of p for `e^(x + more) = 2^k (1 + p)`. `more` is small relative to x,
     and |x| < 2000.
     """
     shifted = w.fma(x, 1 / math.log(2.0), WHOLE)
@@ -87,19 +87,19 @@ def _less_one(w: Writer, x: Value, more: Value | float = 0.0) -> tuple[Value, Va
 
 
 def _exponential(w: Writer, x: Value, more: Value | float = 0.0) -> Value:
-    """Return e^(x + more)."""
+    """Return `e^(x + more)`."""
     k, p, rest = _less_one(w, x, more)
     head, less = two_sum(1.0, p)
     return _scaled(w, head + (less + rest), k)
 
 
 def exponential(w: Writer, x: Value) -> Value:
-    """Return e^x."""
+    """Return `e^x`."""
     return _exponential(w, _within(w, x, -800.0, 800.0))
 
 
 def _mantissa(w: Writer, x: Value) -> DoubleDouble:
-    """Return k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for positive finite x."""
+    """Return k and m of `x = 2^k m` with m from sqrt(1/2) to sqrt(2), for positive finite x."""
     small = x < 2.0**-1022
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
     biased = w.binary("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
@@ -182,7 +182,7 @@ def _logarithm_with(w: Writer, a: Value, x: Value, more: Value) -> Value:
 
 
 def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
-    """Return asinh x = log(1 + a + a^2/(1 + sqrt(1 + a^2))), where a = |x|."""
+    """Return `asinh x = log(1 + a + a^2/(1 + sqrt(1 + a^2)))`, where `a = |x|`."""
     a = w.magnitude(x)
     square, less = two_product(w, a, a)
     total, rest = _sum(w, square, 1.0)
@@ -192,7 +192,7 @@ def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_arccosine(w: Writer, x: Value) -> Value:
-    """Return acosh x = log(1 + t + sqrt(t^2 + 2t)), where t = x - 1."""
+    """Return `acosh x = log(1 + t + sqrt(t^2 + 2t))`, where `t = x - 1`."""
     t = x - 1.0
     square, less = two_product(w, t, t)
     total, rest = _sum(w, square, t + t)
@@ -202,14 +202,14 @@ def hyperbolic_arccosine(w: Writer, x: Value) -> Value:
 
 
 def hyperbolic_arctangent(w: Writer, x: Value) -> Value:
-    """Return atanh x = log(1 + 2a/(1 - a))/2, where a = |x|."""
+    """Return `atanh x = log(1 + 2a/(1 - a))/2`, where `a = |x|`."""
     a = w.magnitude(x)
     q, over = quotient(w, (a + a, w.number(0.0)), two_sum(1.0, -a))
     return w.where(a < 2.0**-28, x, w.intrinsic("copysign", 0.5 * _logarithm_of_more(w, q, -over), x))
 
 
 def cube_root(w: Writer, x: Value) -> Value:
-    """Return x^(1/3)."""
+    """Return `x^(1/3)`."""
     return w.intrinsic("copysign", _raised(w, w.magnitude(x), w.number(_THIRD[0]), _THIRD[1]), x)
 
 
@@ -232,12 +232,12 @@ def remainder(w: Writer, x: Value, y: Value) -> Value:
 
 
 def half_power(w: Writer, x: Value) -> Value:
-    """Return x^(1/2); unlike the square root, it is infinite for -inf and 0 for -0."""
+    """Return `x^(1/2)`; unlike the square root, it is infinite for -inf and 0 for -0."""
     return w.where(x.equals(-math.inf), math.inf, w.root(x) + 0.0)
 
 
 def three_halves_power(w: Writer, x: Value) -> Value:
-    """Return x^(3/2) = x sqrt(x), correctly rounded, for Hertz contact forces."""
+    """Return `x^(3/2) = x sqrt(x)`, correctly rounded, for Hertz contact forces."""
     root = w.root(x)
     head = x * root
     # x (root - sqrt(x)) = x (root^2 - x)/(root + sqrt(x)) = root (root^2 - x)/2
@@ -247,7 +247,7 @@ def three_halves_power(w: Writer, x: Value) -> Value:
 
 
 def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
-    """Return a^(exponent + more) for a >= 0."""
+    """Return `a^(exponent + more)` for a >= 0."""
     log, less = _logarithm(w, a)
     head = exponent * log
     rest = w.fma(exponent, less, product_less(w, exponent, log, head)) + more * log
@@ -255,7 +255,7 @@ def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
 
 
 def real_power(w: Writer, x: Value, y: Value) -> Value:
-    """Return x^y."""
+    """Return `x^y`."""
     found = _raised(w, w.magnitude(x), _within(w, y, -(2.0**100), 2.0**100))
     whole, half = w.intrinsic("roundeven", y).equals(y), 0.5 * y
     odd = whole & w.intrinsic("roundeven", half).differs(half)
@@ -270,12 +270,12 @@ def exponential_of_base_two(w: Writer, x: Value) -> Value:
 
 
 def power(w: Writer, x: Value, exponent: float) -> Value:
-    """Return x^exponent for x > 0, to about 1e-14, for step-size control."""
+    """Return `x^exponent` for x > 0, to about 1e-14, for step-size control."""
     return exponential(w, logarithm(w, x) * exponent)
 
 
 def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
-    """Return (e^x - 1)/4."""
+    """Return `(e^x - 1)/4`."""
     k, p, rest = _less_one(w, x)
     quarter = _power_of_two(w, k - 2)
     most, more = two_sum(quarter, w.number(-0.25))
@@ -284,13 +284,13 @@ def _quarter_less_one(w: Writer, x: Value) -> DoubleDouble:
 
 
 def _plus(a: float, head: Value, rest: Value) -> DoubleDouble:
-    """Return a + (head + rest), if |a| >= |head| or the sum is far larger than a."""
+    """Return `a + (head + rest)`, if |a| >= |head| or the sum is far larger than a."""
     total, less = two_sum(a, head)
     return total, less + rest
 
 
 def exponential_less_one(w: Writer, x: Value) -> Value:
-    """Return e^x - 1."""
+    """Return `e^x - 1`."""
     head, less = _quarter_less_one(w, _within(w, x, -50.0, 710.0))
     return w.where(w.magnitude(x) < 2.0**-54, x, 4.0 * (head + less))
 
@@ -327,7 +327,7 @@ def hyperbolic_tangent(w: Writer, x: Value) -> Value:
 
 
 def logistic(w: Writer, x: Value) -> Value:
-    """Return 1/(1 + e^-x)."""
+    """Return `1/(1 + e^-x)`."""
     k, p, rest = _less_one(w, _within(w, -w.magnitude(x), -800.0, 0.0))
     head, less = two_sum(1.0, p)
     head, less = _scaled(w, head, k), _scaled(w, less + rest, k)

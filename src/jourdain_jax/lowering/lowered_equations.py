@@ -245,7 +245,7 @@ class Lowered:
 
     def watched(self, has_events: bool) -> Nodes:
         """Return the nodes whose signs are monitored: those that decide relations in the rates and, with
-        `has_events`, of the events.
+        `has_events`, in the events.
         """
         return (*self.relations, *(self.event_relations if has_events else ()))
 

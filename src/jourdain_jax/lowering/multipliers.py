@@ -13,8 +13,8 @@ therefore bounded from below by their size at a probe with the same parameters (
 entry of a constraint that is nonlinear in the speeds may be small, though. Such a constraint becomes
 undetermined where the remainder of its row, a row of L^-1 A, passes through zero and reverses.
 
-If M is singular but every admissible velocity has inertia, M is replaced by M + A' W A with positive weights
-W. This changes only the multipliers, because A udot is prescribed.
+If M is singular but every admissible velocity has inertia, `M + A' W A` with positive weights W replaces M.
+This changes only the multipliers, because A udot is prescribed.
 
 Enforce constraints if all speeds are in the state: by multipliers, or, if multipliers are not unique, by
 independent speeds y:

@@ -126,7 +126,7 @@ class Graph:
         return self._node("add", (a, b) if a < b else (b, a))
 
     def _without_wave(self, a: int, b: int) -> int | None:
-        """Return x if a = sin(w)^2 x and b = cos(w)^2 x, or the reverse; None for other products."""
+        """Return x if `a = sin(w)^2 x` and `b = cos(w)^2 x`, or the reverse; None for other products."""
         factors = self._factors(a), self._factors(b)
         if len(factors[0]) != len(factors[1]):
             return None
@@ -224,7 +224,7 @@ class Graph:
         return self._node("div", (a, b))
 
     def power(self, a: int, exponent: int) -> int:
-        """Return a^exponent for an integer exponent, by repeated multiplication."""
+        """Return `a^exponent` for an integer exponent, by repeated multiplication."""
         if exponent < 0:
             return self.div(self.one, self.power(a, -exponent))
         result, square = self.one, a
@@ -320,7 +320,7 @@ class Graph:
         return reduce(self.mul, factors, self.one)
 
     def dot(self, a: Iterable[int], b: Iterable[int]) -> int:
-        """Return sum a_i b_i."""
+        """Return `sum a_i b_i`."""
         return self.total(self.mul(x, y) for x, y in zip(a, b, strict=True))
 
     def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> NodeList:

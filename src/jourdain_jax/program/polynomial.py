@@ -1,5 +1,5 @@
-"""Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a
-short expression.
+"""Normal forms: a node as a polynomial in atoms, modulo `sin^2 + cos^2 = 1` and `sqrt(x)^2 = x`, and back to
+a short expression.
 
 Atoms are inputs and all nodes other than sums, differences and products: sines, cosines, square roots,
 reciprocals. Expansion cancels equal terms. Reconstruction groups terms by their varying part, whose
@@ -118,7 +118,7 @@ class NormalForms:
         return node if found is None else self.rebuilt(found)
 
     def _root(self, p: Polynomial) -> Polynomial:
-        """Return sqrt p, with |x| extracted from x^2 y, and |sin x| from y (1 - cos(x)^2)."""
+        """Return `sqrt p`, with `|x|` extracted from `x^2 y`, and `|sin x|` from `y (1 - cos(x)^2)`."""
         rooted = self._rooted(p)
         if rooted is None:
             atom = self.graph.call("sqrt", self.rebuilt(p))

@@ -152,8 +152,8 @@ class Scene(eqx.Module):
         return None
 
     def gauge(self, pose: Pose) -> Scalar | None:
-        """Return a function S (J s) of a `pose`, or None. Its rate is subtracted from the Lagrangian: L = T
-        - V - dS/dt.
+        """Return a function S (J s) of a `pose`, or None. Its rate is subtracted from the Lagrangian:
+        `L = T - V - dS/dt`.
 
         S does not change the exact motion, but it changes the error of integrators with a discrete
         Lagrangian. Use it to measure this effect.

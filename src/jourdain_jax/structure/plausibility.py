@@ -105,9 +105,9 @@ def _nowhere(x):
 
 
 def without_inertia(M, A):
-    """Return for each state whether a motion x that the rows A permit, A x = 0, has no inertia, M x = 0. Such
-    motions are the null vectors of K, since both terms of K are positive semidefinite; they exist if a pivot
-    of K is zero to round-off.
+    """Return for each state whether a motion x that the rows A permit (`A x = 0`) has no inertia (`M x = 0`).
+    Such motions are the null vectors of K, since both terms of K are positive semidefinite; they exist if a
+    pivot of K is zero to round-off.
 
         K = M + A' A    in speeds of unit inertia, with rows of unit length
 

@@ -126,7 +126,7 @@ def _logarithm(x, u):
 
 
 def exponential(x, u):
-    """Return e^x; complex x only on the host."""
+    """Return `e^x`; complex x only on the host."""
     if np.iscomplexobj(x):
         return exponential(x.real, u) * np.exp(1j * x.imag)
     xp = library(x)

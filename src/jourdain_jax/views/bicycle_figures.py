@@ -16,8 +16,8 @@ _CEILING = 12.0  # 1/s; castering falls far below the range of interest
 
 
 def draw_eigenvalues(study: Study, path: FilePath) -> None:
-    """Draw real and imaginary parts of the eigenvalues over forward speed. Bands, also those of the weave and
-    capsize speeds, span the 2.5 to 97.5 % quantiles of the samples. The stable range is green.
+    """Draw real and imaginary parts of the eigenvalues over forward speed. Bands, including the bands of the
+    weave and capsize speeds, span the 2.5 to 97.5 % quantiles of the samples. The stable range is green.
     """
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(

@@ -165,7 +165,7 @@ class Special(eqx.Module):
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return L and c of the linear equations L X = c. They fix the held values, the size and phase of a
+        """Return L and c of the linear equations `L X = c`. They fix the held values, the size and phase of a
         and b (relative to the point `near`), and w if it is zero.
         """
         z, a0, b0, _ = self.parts(near)

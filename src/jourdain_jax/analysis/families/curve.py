@@ -3,7 +3,7 @@ points of an unknown.
 
     R(z) = 0,   t.(z - z_i) = s        t: unit tangent at z_i, J t = 0;   s: distance along it
 
-Some rows are redundant, so every linear system is solved by singular values, and no product J' J is formed.
+Some rows are redundant, so every linear system is solved by singular values, and no product `J' J` is formed.
 """
 
 from collections.abc import Callable

@@ -81,7 +81,7 @@ PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double ro
 class Look:
     """Equations at one point. Rows are in SI units, unknowns in units of their sizes."""
 
-    R: Float[np.ndarray, "rows"]  # the last rows are those of held values
+    R: Float[np.ndarray, "rows"]  # the last rows hold values constant
     J: Float[np.ndarray, "rows unknowns"]
     # small motions: F and C for (q, y) in SI units, or the multipliers of a periodic motion
     small: tuple[np.ndarray, ...]
@@ -115,7 +115,7 @@ class Motions(ABC):
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:
-        """Return all numbers, those of the unknowns taken from z."""
+        """Return all numbers of the guess, with the unknowns replaced by z."""
         given = self.given.copy()
         given[self.places] = z * self.size
         return given
@@ -218,7 +218,7 @@ class SteadyEquations(Motions):
         of perturbations towards other steady motions.
 
         The columns of T are the directions of other steady motions for the same parameters. The returned
-        eigenvalues are those of P' A P, where the columns of P are orthonormal and perpendicular to T.
+        eigenvalues are those of `P' A P`, where the columns of P are orthonormal and perpendicular to T.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
         F, C = look.small

@@ -3,9 +3,10 @@
     lag y' + y = x,   y(t0) = x(t0);      read at t - delay
 
 A motion is computed at equal intervals h. Between these times, x is the polynomial of degree 5 through the
-six nearest points. Its error for an angular frequency w is 0.005 (w h)^6 of the amplitude, or 0.02 (w h)^6 in
-the first and last two intervals. Near a jump J of the slope, the error is up to 0.18 J h (0.26 J h at the
-ends). Near a jump J of the second derivative, it is up to 0.032 J h^2 (0.075 J h^2 at the ends).
+six nearest points. Its error for an angular frequency w is `0.005 (w h)^6` of the amplitude, or
+`0.02 (w h)^6` in the first and last two intervals. Near a jump J of the slope, the error is up to `0.18 J h`
+(`0.26 J h` at the ends). Near a jump J of the second derivative, it is up to `0.032 J h^2` (`0.075 J h^2` at
+the ends).
 
 The filter is exact for that polynomial p. With rho = lag / h, and s intervals after time k:
 

@@ -55,9 +55,9 @@ class Sensor(eqx.Module):
 
     With a delay or a lag, the motion (with `shooting`, each piece of it) is computed at 64 or more equal
     intervals, none longer than the median interval of the samples, and interpolated by quintic polynomials.
-    For intervals h and an angular frequency w, the error is about 0.02 (w h)^6 of the amplitude. Near a jump
-    J of the slope, such as that of a speed when a force jumps, the error is up to 0.26 J h. Near a jump J of
-    the second derivative, it is up to 0.08 J h^2.
+    For intervals h and an angular frequency w, the error is about `0.02 (w h)^6` of the amplitude. Near a
+    jump J of the slope, such as that of a speed when a force jumps, the error is up to `0.26 J h`. Near a
+    jump J of the second derivative, it is up to `0.08 J h^2`.
 
     Under `jit` times are unknown, and there are two intervals per sample: give a first sample at or near
     `t0`.

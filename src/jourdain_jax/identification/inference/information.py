@@ -87,7 +87,7 @@ class Information:
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Return the information with the covariance of the shared unknowns from the differences between
-        runs: C (sum g g') C n / (n - 1). C is the previous covariance and g are the scores of the n runs.
+        runs, `C (sum g g') C n / (n - 1)`. C is the previous covariance and g are the scores of the n runs.
 
         The runs' own unknowns follow the shared ones; the variance due to their own noise is kept. Source:
         K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.

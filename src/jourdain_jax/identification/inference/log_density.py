@@ -4,7 +4,7 @@
     theta = constrain(x),   x = centre + F z
 
 L: `log_likelihood`; x: one real number for each unknown (`Range`). centre and F are zero and the identity, or
-come from a fit (`whitened`). A correlation time tau enters theta as arcsin rho, rho = exp(-h / tau), h: the
+come from a fit (`whitened`). A correlation time tau enters theta as arcsin rho, `rho = exp(-h / tau)`, h: the
 shortest interval, with a uniform prior (Jeffreys' prior of AR(1) noise). Source: A. Gelman et al., Bayesian
 Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """

@@ -3,9 +3,9 @@
     F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior
     cov(theta) >= F^-1      (Cramer and Rao)
 
-y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. For some of the unknowns, with
-all others estimated as well, log det F follows from their block of F^-1. Source: A. C. Atkinson, A. N. Donev
-and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
+y_k: reading k, with noise sigma_k; theta: the unknowns, start values included. If only some of the unknowns
+are of interest, `log det F` is computed from their block of `F^-1`. Source: A. C. Atkinson, A. N. Donev and
+R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -52,7 +52,7 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def covariance(self) -> Matrix:
-        """Return F^-1, with unbounded entries for undetermined combinations of unknowns."""
+        """Return `F^-1`, with unbounded entries for undetermined combinations of unknowns."""
         return _inverse(self.matrix)
 
     @property

@@ -218,7 +218,7 @@ class Estimates(Printed):
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
         """Return, for each channel over all runs, the correlation of neighbouring whitened residuals, and the
-        limit 3.5 / sqrt(pairs), which white noise rarely exceeds.
+        limit `3.5 / sqrt(pairs)`, which white noise rarely exceeds.
         """
         found = {}
         for name in dict.fromkeys(name for run in self.whitened for name in run):
@@ -245,10 +245,10 @@ class Estimates(Printed):
 
             found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
 
-        With y = f(scene), var(y) = g' C g to first order (the delta method), where g = d y / d theta and C is
-        the covariance of the estimates. A combination of unknowns may have an interval even if the unknowns
-        are not identifiable separately. The result is NaN if it depends on an undetermined direction, or on
-        an unknown at its bound.
+        To first order (the delta method), the variance is `g' C g`, where g is the derivative of the quantity
+        with respect to the unknowns and C is the covariance of the estimates. A combination of unknowns may
+        have an interval even if the unknowns are not identifiable separately. The result is NaN if it depends
+        on an undetermined direction, or on an unknown at its bound.
 
         - `function`: a function of a scene, in plain JAX, that returns an array of any shape. `unit`: unit of
           the result, for `print`.

@@ -83,10 +83,10 @@ class Fit(Estimates):
         """Write this fit as one self-contained HTML file: estimates, warnings, undetermined combinations,
         correlations, residuals, the path to the minimum.
 
-        - `data`: the fitted runs; their samples are drawn with the prediction, with R^2 = 1 - sum (prediction
-          - value)^2 / sum (value - mean)^2. The report shows the share of each run, channel and time span in
-          the information on each unknown. The share of sample k is a_k^2 / sum a^2, with a = C J', the
-          covariance C and the derivatives J.
+        - `data`: the fitted runs; their samples are drawn with the prediction and its
+          `R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2`. The report shows the share of each
+          run, channel and time span in the information on each unknown. The share of sample k is
+          `a_k^2 / sum a^2`, with `a = C J'`, the covariance C and the derivatives J.
         - `held_out`: other runs, predicted as by `predict`.
         - `profiles`: True or names of unknowns, to compute their profiles now; or the result of
           `Fit.profiles`.

@@ -118,8 +118,8 @@ class Prediction(Printed):
 
     @property
     def r_squared(self) -> float:
-        """Return 1 - sum error^2 / sum (value - mean)^2, with the mean of each component of the channel; NaN
-        for constant values.
+        """Return `1 - sum error^2 / sum (value - mean)^2`, with the mean of each component of the channel;
+        NaN for constant values.
         """
         values = np.where(np.isfinite(self.error), self.values, np.nan)
         spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2)

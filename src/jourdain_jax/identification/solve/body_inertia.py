@@ -10,7 +10,7 @@ if a distribution of mass can have it. I is linear in D; a flat body has a zero 
 If two axes share one parameter, their moments of inertia are equal, and so are their D. The parameters p_k
 are found by differentiating the inertia matrix.
 
-A `Tie` makes a parameter depend on others in a fit, such as those of two equal wheels:
+A `Tie` makes a parameter depend on others in a fit, such as equal radii of two wheels:
 
     p = f(scene)      f: plain JAX, of the scene with the unknowns and all previously tied parameters
 

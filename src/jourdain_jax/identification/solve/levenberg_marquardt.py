@@ -274,7 +274,7 @@ class Loss:
         )
 
     def weight(self, r: Samples) -> Samples:
-        """Return the weight w = rho'(r) / r."""
+        """Return the weight `w = rho'(r) / r`."""
         k = self.parameter
         if self.kind == "student-t":
             return (k + 1) / (k + r**2)
@@ -285,7 +285,7 @@ class Loss:
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:
-        """Return the factor of the covariance (J'WJ)^-1, after `determined` unknowns were fitted to `r`."""
+        """Return the factor of the covariance `(J'WJ)^-1`, after `determined` unknowns were fitted to `r`."""
         if not np.isfinite(bend := self.bend(r)):
             return bend
         psi, slope = self.weight(r) * r, self._slope(r)

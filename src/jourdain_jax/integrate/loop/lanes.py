@@ -37,7 +37,7 @@ class MachineWriter(Writer):
         return self.instruction(self.real, text)
 
     def power(self, x: Value, exponent: float) -> Value:
-        """Return x^exponent."""
+        """Return `x^exponent`."""
         return power(self, x, exponent)
 
     def if_any(self, condition: Value, body: Callable[[], object]) -> None:

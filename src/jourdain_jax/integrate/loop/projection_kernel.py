@@ -80,7 +80,7 @@ def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> None:
-    """Write `inverted(B, weights)`, which computes, after `rotated`, the weights S^-2 of the rows. Rows
+    """Write `inverted(B, weights)`, which computes, after `rotated`, the weights `S^-2` of the rows. Rows
     shorter than `cutoff` times the longest have zero weight.
     """
     with w.procedure("inverted", "B weights") as (B, weights):
@@ -98,7 +98,7 @@ def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> 
 
 
 def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
-    """Write `solved(B, weights, b, x)`, which computes x = A+ b."""
+    """Write `solved(B, weights, b, x)`, which computes `x = A+ b`."""
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
         cleared(w, x, columns)
@@ -139,7 +139,7 @@ def write_cholesky(w: MachineWriter, n: int) -> None:
 
 
 def write_triangular(w: MachineWriter, n: int) -> None:
-    """Write `forward(L, x)` and `backward(L, x)`, which replace x by L^-1 x and by L'^-1 x."""
+    """Write `forward(L, x)` and `backward(L, x)`, which replace `x` by `L^-1 x` and by `L'^-1 x`."""
     with w.procedure("forward", "L x") as (L, x), w.counted(n) as i:
         row = w.at(L, i * n)
         w.store((w.load(x, i) - _product_of_rows(w, row, x, i)) / w.load(row, i), x, i)

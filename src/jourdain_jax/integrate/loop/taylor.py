@@ -156,7 +156,7 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     coefficient of a product costs a sum. `moving`: varying inputs.
 
     Sums and products are expanded into terms. Then the sharing that saves the most products is applied
-    repeatedly: x y is computed once if several terms contain it, and x y + x z = x (y + z) within a sum. For
+    repeatedly: `x y` is computed once if several terms contain it, and `x y + x z` becomes `x (y + z)`. For
     example, the accelerations of a disc, with s, c = sin, cos of its lean, take 12 products at first, and 7
     with p = v w/c and q = c u:
 
@@ -346,7 +346,7 @@ def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients])
 
 
 def at_time(w: MachineWriter, series: Coefficients, s: Value) -> Value:
-    """Return sum_k x_k s^k."""
+    """Return `sum_k x_k s^k`."""
     total = series[-1]
     for x in reversed(series[:-1]):
         total = w.fma(total, s, x)

@@ -170,8 +170,8 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
       = -e w_n, and Coulomb's law for the slip afterwards. The other laws integrate over the normal impulse,
       with friction against the instantaneous slip. They differ in the end of the integral. "newton": w_n+ =
       -e w_n. "poisson": the impulse of restitution is e times the impulse of compression. "energetic": its
-      work is -e^2 times the work of compression. These laws need a ball, or slip of constant direction, as in
-      plane motion; otherwise a result code reports the failure.
+      work is `-e^2` times the work of compression. These laws need a ball, or slip of constant direction, as
+      in plane motion; otherwise a result code reports the failure.
 
     The contact has two velocity constraints (m/s), along the ground's tangents. Raises ValueError for an
     unknown height, for a length that is not positive, and, when the scene is built, for a ball that is too
