@@ -249,7 +249,7 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
 
 def reason_against_watching(setup: Setup) -> str:
     """Return why relations in loads or stop events are not all monitored; empty if they are, or if there are
-    none. Parts that remain JAX calls may contain relations that are not known.
+    none. Parts of a scene without a scalar form may contain relations that are not known.
     """
     program = setup.field.lowered
     hides = program is not None and program.graph.calls([*program.qdot, *program.ydot, *program.events])
