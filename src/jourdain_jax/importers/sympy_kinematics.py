@@ -225,9 +225,8 @@ def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tup
             turn = (sympy.rot_ccw_axis1, sympy.rot_ccw_axis2, sympy.rot_ccw_axis3)[along[0]](angle)
             return system.with_coordinates({angle: rates[along[0]]}), (base * turn, parent, turn)
     raise ValueError(
-        f"frame `{frame.name}` has no orientation in `{system.frame.name}`, nor an angular velocity about "
-        "one axis of a frame that has; orient it by coordinates, such as `orient_axis(parent, parent.y, "
-        "angle)`"
+        f"frame `{frame.name}` has no orientation in `{system.frame.name}`, and does not turn about a single "
+        "axis of an oriented frame; orient it by coordinates, such as `orient_axis(parent, parent.y, angle)`"
     )
 
 

@@ -168,8 +168,8 @@ def _array(x) -> Float[Array, "*shape"]:
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
-    """Return the coordinates of a joint, as arguments of `jj.coordinates`. Those of the base have no
-    prefix.
+    """Return the coordinates of a joint, as arguments of `jj.coordinates`. Coordinates of the
+    base have no prefix.
     """
     label = f"{name}_" if joint.name else ""
     if joint.kind == "ball":

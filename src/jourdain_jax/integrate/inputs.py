@@ -363,7 +363,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
             raise ValueError(
                 f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
-                "loads and potentials may depend on modes"
+                "loads, potentials and events may depend on modes"
             )
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return

@@ -98,7 +98,7 @@ def _next_retries(
 
 
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """Replace the samples at `index` by those of `again`."""
+    """Replace the samples at `index` by the samples of `again`."""
     leaves, treedef = jax.tree.flatten(lanes)
     new = [np.array(x) for x in leaves]
     for old, y in zip(new, jax.tree.leaves(again), strict=True):

@@ -125,7 +125,8 @@ def start(
     or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
     `values` at time `t0` (s), by keyword or in a dictionary `given` (keywords take precedence), stay fixed.
-    Only if they violate the constraints by at most 1.5e-5, as rounded numbers may, are they moved onto them.
+    If they violate the constraints by at most 1.5e-5, as rounded numbers may, they are moved onto the
+    constraints.
 
     The search for omitted coordinates begins at zero (for a quaternion: at the identity). If it fails or
     leaves the scene's `domain`, it begins again at other states of the domain, nearest first; `guess` of the

@@ -272,7 +272,9 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
-    """Return the quantities that are nonzero at distant states; for constraints, beyond round-off."""
+    """Return the names of quantities that are nonzero at distant states. Values of constraints count as zero
+    within round-off.
+    """
     some = np.sqrt(eps_of(found.A))
     seen = {name for name, rates in found.vanishing.items() if moves(rates)} - {"rows at rest"}
     rows = (

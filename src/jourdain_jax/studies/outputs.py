@@ -360,7 +360,7 @@ class Task:
         return dict(found)
 
     def identity(self) -> dict[str, str]:
-        """Return digests of everything that determines the numbers, under the names of the arguments."""
+        """Return digests of all arguments that determine the results, by name."""
         drawn = self.design
         design = dict(drawn.variables), drawn.sampler, len(drawn), drawn.seed, drawn.correlation
         return {

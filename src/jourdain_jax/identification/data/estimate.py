@@ -205,8 +205,8 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
         raise ValueError(
-            "`covariance` of `joint_normal` is not a covariance matrix: its correlations have "
-            f"the eigenvalue {least:.3g}, expected none below zero"
+            "`covariance` of `joint_normal` is not a covariance matrix: its correlation matrix has "
+            f"the negative eigenvalue {least:.3g}"
         )
     return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
 

@@ -113,8 +113,8 @@ def variances(
 
 
 def students_t_95(degrees):
-    """Return the 97.5 % quantile of Student's t with at least one degree of freedom; beyond 1e7, of a normal
-    distribution.
+    """Return the 97.5 % quantile of Student's t distribution, with the degrees of freedom limited to 1 to
+    1e7.
     """
     return stdtrit(np.clip(degrees, 1.0, 1e7), 0.975)
 

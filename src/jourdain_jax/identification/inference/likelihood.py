@@ -305,7 +305,7 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(
                 f"the noise of channel `{name}` has a correlation time, but the filter assumes white noise; "
-                "omit it"
+                "omit the time"
             )
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):
@@ -322,7 +322,7 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
             if isinstance(reading.operation, Instrument):
                 raise ValueError(
                     f"{which} measures accelerations, which contain the white disturbance "
-                    "itself; omit it, or use `fit`"
+                    "itself; omit the channel, or use `fit`"
                 )
         for name, given in run.unknown_start.items():
             if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):

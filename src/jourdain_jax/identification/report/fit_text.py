@@ -149,8 +149,8 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return the mean square that lies this many standard deviations from 1, by the nearly normal
-    distribution of its cube root (Wilson and Hilferty). `spread`: the standard deviation of the mean square.
+    """Return a limit of the mean square of normal residuals, this many standard deviations from 1. Its cube
+    root is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 

@@ -214,7 +214,7 @@ def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Ro
 
 
 def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """Write code that initialises the cotangents of a block with those of its end states."""
+    """Write code that initialises the cotangents of a block with the cotangents of its end states."""
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
     each_row(w, form.integrated, g, lambda i: 0.0)

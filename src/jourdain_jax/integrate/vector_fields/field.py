@@ -162,7 +162,7 @@ class Instant(NamedTuple):
 
 class VectorField(eqx.Module):
     """Interface of the integrated state of a scene: packing, unpacking, rates and projection. All fields are
-    static, except those of the reduction.
+    static, except the arrays of the reduction.
     """
 
     independent: Indices | None = static()  # indices of the independent speeds; None: the full state

@@ -1,6 +1,5 @@
-"""Trajectories: motions over time, with access by name and diagnostics.
-
-Small plots of coordinates over time, shown in notebooks.
+"""Trajectories: motions over time, with access by name, diagnostics, and the small plots that notebooks
+show.
 """
 
 from collections.abc import Mapping
