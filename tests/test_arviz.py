@@ -63,7 +63,7 @@ def test_log_likelihoods_of_the_samples_add_up_to_that_of_the_runs(about):
 def test_draws_need_chains_a_density_and_arviz(fitted, monkeypatch):
     data, fit = fitted
     robust = jj.fit(TRUTH, data, free=("offset",), loss=huber())
-    with pytest.raises(ValueError, match="a robust loss has no density"):
+    with pytest.raises(ValueError, match="a robust loss has no probability density"):
         robust.to_arviz(data)
     with monkeypatch.context() as missing:
         missing.setitem(sys.modules, "arviz", None)

@@ -14,7 +14,7 @@ from jourdain_jax.importers.formulas import sympy_package
 class MechanicalSystem:
     """A mechanical system of SymPy, with expressions in q(t), u(t), t and constants."""
 
-    given: Mapping[str, float]  # numbers of constants, by name
+    given: Mapping[str, float]  # values of constants, by name
     origin: Any  # the point from which positions are measured
     frame: Any  # the inertial frame
     coordinates: tuple[Any, ...]

@@ -69,7 +69,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
 
 
 class Values:
-    """A hashable key of a scene: its class and the numbers of its leaves."""
+    """A hashable key of a scene: its class and the values of its leaves."""
 
     def __init__(self, leaves: list, treedef):
         self.leaves, self.structure = leaves, (treedef, jax.config.jax_enable_x64)
@@ -108,7 +108,7 @@ _STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 @contextmanager
 def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
-    """Return a context in which the numbers of `scene` replace traced parameters of scenes of the
+    """Return a context in which the values of `scene` replace traced parameters of scenes of the
     same structure.
 
     `varied`: names of the parameters (None: all) that get generic numbers near those of `scene`.

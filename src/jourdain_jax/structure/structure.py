@@ -367,7 +367,7 @@ class Reference:
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
-        """Return a context in which the numbers of this scene replace traced parameters."""
+        """Return a context in which the values of this scene replace traced parameters."""
         with reference_parameters(self.scene, self._varied):
             yield
 

@@ -62,7 +62,7 @@ class Distribution:
         return self._inverse(u, *vars(self).values())
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Return derivatives of `values(u)` with respect to the numbers of the distribution, by name. They
+        """Return derivatives of `values(u)` with respect to the parameters of the distribution, by name. They
         are computed by complex steps, exact to round-off.
         """
         known, tiny = vars(self), 1e-30

@@ -8,7 +8,7 @@ program for the outputs.
 
 Block b of B samples holds samples b B to (b + 1) B - 1, independently of the chunks in which results are
 stored. The last block is padded with copies of its last sample. All blocks run the same compiled programs on
-arrays of the same shapes, so the numbers of a sample do not depend on chunks, order or processes.
+arrays of the same shapes, so the results of a sample do not depend on chunks, order or processes.
 """
 
 import math
@@ -253,7 +253,7 @@ SAVES = ("statistics", "outputs")
 
 @dataclass(frozen=True)
 class Task:
-    """Everything that determines the numbers of a study."""
+    """Everything that determines the results of a study."""
 
     scene: Scene
     design: Design  # parameters by name, start values by name and AT_START

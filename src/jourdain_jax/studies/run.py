@@ -74,7 +74,7 @@ class Runner:
         self.grid = Grid.from_dict(kept, len(task.outputs))
 
     def run(self, number: int) -> tuple[int, int]:
-        """Compute and store a chunk. Return the numbers of its samples and of its failed samples."""
+        """Compute and store a chunk. Return how many samples it has and how many failed."""
         first, last = self.store.span(number)
         kept, tallies = [], []
         for number_of_block in range(first // self.task.block, -(-last // self.task.block)):
@@ -340,7 +340,7 @@ def run(
     """Compute the missing part of a task in the folder `path`.
 
     `shard`: (k, n) selects the chunks whose index is k - 1 modulo n. `workers(store, numbers, interrupted)`
-    yields the numbers of samples and of failed samples of each chunk.
+    yields the counts of samples and of failed samples of each chunk.
     """
     if not Store.is_taken(path):
         memory.check_disk(path, len(task.design) / shard[1] * task.bytes_of_kept_lane)

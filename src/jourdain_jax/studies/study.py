@@ -251,7 +251,7 @@ class Study(Printed):
         return StudyResult(store, task)
 
     def mean_gradients(self, *, parameters: Sequence[str] = (), **what: Unpack[TaskFields]) -> MeanGradients:
-        """Return derivatives of the means of all outputs with respect to the numbers of the distributions,
+        """Return derivatives of the means of all outputs with respect to parameters of the distributions,
         and to shared `parameters`.
 
         They are pathwise derivatives: means of the exact derivatives of the samples' motions, in forward

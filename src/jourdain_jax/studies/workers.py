@@ -87,7 +87,7 @@ def whatever_dies(
     """Yield the counts of the chunks `numbers`, even if some processes die. Chunks on which processes die
     repeatedly are omitted with a warning.
 
-    - `compute(numbers, alone)`: a generator that yields the numbers of samples and of failed samples of each
+    - `compute(numbers, alone)`: a generator that yields the counts of samples and of failed samples of each
       chunk. It returns the indices of unfinished chunks if a process died.
     - `attempts`: number of times that each unfinished chunk is tried alone, to exclude other chunks as the
       cause.
@@ -139,7 +139,7 @@ def sent_to_others(task: Task) -> bytes:
 def computed(
     submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int
 ) -> Generator[tuple[int, int], None, list[int]]:
-    """Yield the numbers of samples and of failed samples of each chunk when it finishes. At most `most`
+    """Yield the counts of samples and of failed samples of each chunk when it finishes. At most `most`
     chunks run at once. Return the indices of chunks on which a process died.
 
     `submit(number)`: a future of `concurrent.futures`; `deadly`: the error that reports a dead process.

@@ -305,7 +305,7 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(
                 f"the noise of channel `{name}` has a correlation time, but the filter assumes white noise; "
-                "omit the time"
+                "omit `correlation_time`"
             )
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):

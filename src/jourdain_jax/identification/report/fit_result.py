@@ -132,7 +132,7 @@ class Fit(Estimates):
         self._check_one()
         asked = self.asked
         if asked.loss != LEAST_SQUARES:
-            raise ValueError("a robust loss is no probability density; fit by least squares")
+            raise ValueError("a robust loss has no probability density; fit by least squares")
         density = log_density(asked.scene, data, asked.free, options=asked.options).whitened(self)
         if z is None:
             z = np.random.default_rng(0).normal(size=(4, 1000, len(density.labels)))
