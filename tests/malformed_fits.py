@@ -279,7 +279,7 @@ PRIORS: dict[str, str] = {
     ),
     "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.5], [0.4, 1.0]])": "is not symmetric",
     "jj.identification.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 2.0], [2.0, 1.0]])": (
-        "its correlations have the eigenvalue -1"
+        "its correlation matrix has the negative eigenvalue -1"
     ),
     (
         "jj.fit(cart, jj.Experiment(TS, {'x': TS}, 0.01, start={'x': 0.3}, "
