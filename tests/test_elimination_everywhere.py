@@ -238,3 +238,58 @@ def test_which_scenes_keep_all_speeds(name):
         "privileged, lowered to machine code" if name == "chaplygin-sleigh" else by_multipliers
     )
     assert_allclose(full.u_end, motion.u_end, atol=1e-9)
+
+
+class CarAtItsMiddle(jj.Scene):
+    """A car whose rear blade is at the middle of its base: a coefficient of its constraints is zero there."""
+
+    base: float = jj.parameter(2.6, unit="m", positive=True)
+    coordinates = jj.coordinates("x y heading steer")
+    privileged = ("x_rate", "steer_rate")
+    domain = {"heading": (-1.2, 1.2), "steer": (-0.7, 0.7)}
+
+    def bodies(self, t, q):
+        car, axle = jj.rot_z(q.heading), jj.vec(q.x, q.y, 0)
+        middle, front = (axle + share * self.base * car[:, 0] for share in (0.5, 1.0))
+        return {
+            "car": jj.RigidBody.box(900.0, (3.6, 1.5, 1.0), position=middle, orientation=car),
+            "front": jj.RigidBody(30.0, jnp.ones(3), front, car @ jj.rot_z(q.steer)),
+        }
+
+    def velocity_constraints(self, motion):
+        car, front = motion["car"], motion["front"]
+        return {
+            "rear": jj.knife_edge(car, car.place((-1.3, 0.0, 0.0)), car.orientation[:, 1]),
+            "front": jj.knife_edge(front, front.position, front.orientation[:, 1]),
+        }
+
+
+@pytest.mark.parametrize("base", [2.6, 2.6 * (1 + 1e-9), 2.0])
+def test_no_pivot_is_a_coefficient_that_vanishes_for_the_given_parameters(base):
+    scene = CarAtItsMiddle(base=base)
+    start = jj.start(scene, x_rate=1.0, steer=0.2)
+    motion = jj.simulate(scene, start, t1=1.0)
+    assert motion.succeeded
+    front = 1.3 + 0.5 * base  # from the rear blade to the front one, m
+    assert_allclose(start["heading_rate"], np.tan(0.2) / front, rtol=1e-12)
+    assert_allclose(motion["heading"][-1], motion["heading_rate"][0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_a_pivot_of_parameters_whose_terms_nearly_cancel_is_a_code_in_lanes(backend):
+    class Longer(CarAtItsMiddle):  # a class of its own, for which no pivots have been chosen before
+        base: float = jj.parameter(3.0, unit="m", positive=True)
+
+    scene, off = Longer(), np.array([0.0, 1e-12, 1e-9, -1e-7, 1e-6, 1e-4, -1e-3, 0.1])
+
+    @jax.jit
+    @jax.vmap
+    def end(base):
+        motion = jj.simulate(scene.replace(base=base), {"x_rate": 1.0, "steer": 0.2}, t1=1.0, backend=backend)
+        return motion.result, motion.q_end[2], jnp.tan(0.2) / (1.3 + 0.5 * base)
+
+    code, heading, rate = end(2.6 * (1 + off))
+    assert np.all(code[:5] != results.SUCCESS)
+    assert np.all(code[1:5] == results.SINGULAR_PARTITION)
+    assert np.all(code[5:] == results.SUCCESS)
+    assert_allclose(heading[5:], rate[5:], rtol=1e-9)
