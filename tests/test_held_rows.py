@@ -304,5 +304,5 @@ def test_what_cannot_hold_is_refused():
         def loads(self, motion):
             return elsewhere(motion)
 
-    with pytest.raises(ValueError, match="outside the method"):
+    with pytest.raises(ValueError, match="`joint_friction` in `loads` itself, not in a function"):
         jj.simulate(Outside(), {}, t1=1.0)

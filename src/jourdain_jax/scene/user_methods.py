@@ -127,8 +127,8 @@ def _declared(scene: Scene, names: Iterable[str], method: str, word: str) -> Non
     for name in names:
         if name not in scene.switching.contacts:
             raise ValueError(
-                f"`{name}` of `{_name(scene)}` had no friction when the scene was made; use `{word}` in "
-                f"`{method}` for every state"
+                f"no friction of `{name}` of `{_name(scene)}` was found when the scene was made; write "
+                f"`{word}` in `{method}` itself, not in a function that it calls, and for every state"
             )
 
 
@@ -152,7 +152,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
         if (contact.friction is not None) != (name in scene.switching.contacts):
             raise ValueError(
                 f"contact `{name}` of `{_name(scene)}` gained or lost its friction after the scene was made; "
-                "use `friction=` in `contacts` for every state or for none"
+                "write `friction=` in `contacts` itself, not in a function that it calls, for every state or "
+                "for none"
             )
     return contacts
 
