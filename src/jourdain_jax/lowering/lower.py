@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import Indices, is_traced
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.rows import names_of_events, stops
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
@@ -35,7 +36,7 @@ from jourdain_jax.scene.coordinates import parameters_of
 from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
-from jourdain_jax.structure.trace import Variables, traced_scene
+from jourdain_jax.structure.trace import Variables, named_values, traced_scene
 
 # Maximum numbers of operations of a program before simplification, with XLA and with machine code. Larger
 # scenes use dense matrices. With XLA, a program of 20,000 operations takes about a minute longer to compile
@@ -50,7 +51,7 @@ MOST_TERMS = 200  # maximum number of terms of one normal form
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
     """Return the lowered equations of the scene's class, or the reason why there are none. They are built
-    once per class, shapes and independent speeds.
+    once per class, shapes, independent speeds and vanishing pivots.
 
     `every_speed`: whether all speeds stay in the state, with multipliers for the constraints (default: only
     if no choice of independent speeds is valid everywhere).
@@ -64,7 +65,23 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     kept += structure.potentials_of_inputs, structure.may_set_in
     if every_speed:
         kept += structure.dependent_rows, structure.well_conditioned and structure.independent
-    return _lowered(with_reference_parameters(scene), every_speed, massless, kept)
+    scene = with_reference_parameters(scene)
+    found = _lowered(scene, every_speed, massless, kept)
+    vanishing = () if isinstance(found, NotLowered) else _vanishing(found, scene)
+    return _lowered(scene, every_speed, massless, (*kept, vanishing)) if vanishing else found
+
+
+def _vanishing(program: Lowered, scene: Scene) -> Indices:
+    """Return which pivots that depend only on parameters vanish for the parameters of this scene. Other
+    scenes of its class may have led to these pivots.
+    """
+    fixed = [k for k, n in enumerate(program.pivots) if not program.graph.varies[n]]
+    if not fixed:
+        return ()
+    names = scene.coordinate_names, scene.speed_names, scene.inputs
+    at_zero = named_values(scene, 0.0, *(np.zeros(len(of)) for of in names))
+    sizes = np.abs(Probes(program.graph, at_zero)(program.pivots[k] for k in fixed)[:, 0])
+    return tuple(k for k, size in zip(fixed, sizes, strict=True) if not size >= SMALLEST_PIVOT)
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
