@@ -2,6 +2,7 @@
 multipliers elsewhere.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -244,13 +245,14 @@ class CarAtItsMiddle(jj.Scene):
     """A car whose rear blade is at the middle of its base: a coefficient of its constraints is zero there."""
 
     base: float = jj.parameter(2.6, unit="m", positive=True)
+    share: float = eqx.field(static=True, default=0.5)  # of the base, from the point x, y to the mass centre
     coordinates = jj.coordinates("x y heading steer")
     privileged = ("x_rate", "steer_rate")
     domain = {"heading": (-1.2, 1.2), "steer": (-0.7, 0.7)}
 
     def bodies(self, t, q):
         car, axle = jj.rot_z(q.heading), jj.vec(q.x, q.y, 0)
-        middle, front = (axle + share * self.base * car[:, 0] for share in (0.5, 1.0))
+        middle, front = (axle + share * self.base * car[:, 0] for share in (self.share, 1.0))
         return {
             "car": jj.RigidBody.box(900.0, (3.6, 1.5, 1.0), position=middle, orientation=car),
             "front": jj.RigidBody(30.0, jnp.ones(3), front, car @ jj.rot_z(q.steer)),
@@ -259,7 +261,7 @@ class CarAtItsMiddle(jj.Scene):
     def velocity_constraints(self, motion):
         car, front = motion["car"], motion["front"]
         return {
-            "rear": jj.knife_edge(car, car.place((-1.3, 0.0, 0.0)), car.orientation[:, 1]),
+            "rear": jj.knife_edge(car, car.place((-2.6 * self.share, 0.0, 0.0)), car.orientation[:, 1]),
             "front": jj.knife_edge(front, front.position, front.orientation[:, 1]),
         }
 
@@ -297,3 +299,29 @@ def test_a_pivot_of_parameters_whose_terms_nearly_cancel_is_a_code_in_lanes(back
     assert np.all(code[1:5] == results.SINGULAR_PARTITION)
     assert np.all(code[5:] == results.SUCCESS)
     assert_allclose(heading[5:], rate[5:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lengths_near_those_at_which_a_coefficient_vanishes_are_right_or_a_code(seed):
+    class Fresh(CarAtItsMiddle):
+        pass
+
+    draws = np.random.default_rng(seed)
+    scene = Fresh(base=3.0, share=float(draws.uniform(0.2, 0.8)))
+    off = draws.choice([-1.0, 1.0], 24) * 10.0 ** draws.uniform(-14.0, -1.0, 24)
+    bases = 2.6 * (1 + np.append(off, 0.0))
+
+    @jax.jit
+    @jax.vmap
+    def end(base):
+        motion = jj.simulate(scene.replace(base=base), {"x_rate": 1.0, "steer": 0.2}, t1=1.0)
+        return motion.result, motion.q_end[2]
+
+    code, heading = end(bases)
+    right = np.tan(0.2) / ((1 - scene.share) * bases + 2.6 * scene.share)
+    there = code == results.SUCCESS
+    assert 5 <= there.sum() < len(bases)
+    assert_allclose(heading[there], right[there], rtol=1e-8)
+    for base, expected in list(zip(bases, right, strict=True))[-4:]:
+        motion = jj.simulate(scene.replace(base=float(base)), {"x_rate": 1.0, "steer": 0.2}, t1=1.0)
+        assert_allclose(motion.q_end[2], expected, rtol=1e-8)
