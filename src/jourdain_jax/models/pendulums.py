@@ -4,9 +4,10 @@ geometric constraints.
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole, is_traced
 from jourdain_jax.calculus.rotations import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle, Visual
@@ -198,8 +199,11 @@ class PendulumChain(Heavy):
 
     @property
     def domain(self):
-        """Return the domain: within the reach of the chain."""
-        return {f"{axis}{i}": (-0.3 * i, 0.3 * i) for i in range(1, self.links + 1) for axis in "xz"}
+        """Return the domain: within the reach of the chain; within that of the default lengths where lengths
+        are traced.
+        """
+        reach = np.cumsum(np.broadcast_to(0.3 if is_traced(self.length) else self.length, self.links))
+        return {f"{axis}{i + 1}": (-r, r) for i, r in enumerate(reach.tolist()) for axis in "xz"}
 
     @property
     def example(self):
