@@ -1,7 +1,7 @@
 """Compute the matrices of small motions: A, B of the first-order form; M, C, K, F of the second-order form
 (`linearize.py`).
 
-Perturbations of a state on the constraint manifold, and the choice of independent ones.
+A perturbation of a state on the constraint manifold satisfies
 
     dq = E ds,   dg = G ds = 0,   dphi = Phi_s ds + A du + Phi_f df = 0
 

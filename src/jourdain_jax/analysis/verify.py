@@ -16,9 +16,9 @@ gradients          of udot and A' lambda: forward against reverse mode, and agai
 `statements.py` has the first three checks. All checks run once, without compilation, which would take several
 times longer.
 
-Compute the energy of a scene, and determine whether it is conserved.
+`energy` computes the energy of a scene, and `energy_balance` names the powers that change it:
 
-E = T + V,   T = sum m v.v/2 + omega.I omega/2
+    E = T + V,   T = sum m v.v/2 + omega.I omega/2
     dE/dt = power of loads without a potential (`dynamics/reactions.py`)
 """
 

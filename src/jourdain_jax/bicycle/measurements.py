@@ -15,10 +15,9 @@ independent, but parameters that depend on the same readings are correlated: all
 stiffness of the rod, and the inertia about y on the mass centre. Source: J. D. G. Kooijman, M.Sc. thesis,
 Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 
-Files of raw measurements of a bicycle, `name = reading+/-sigma, reading+/-sigma, ...` per line: lengths,
-masses, angles and periods of its parts.
-
-Format of BicycleParameters (Moore, Hubbard & Kooijman), files `*Measured.txt`. n readings of one quantity are
+`read_readings` reads a file of raw measurements with one quantity per line, `name = reading+/-sigma,
+reading+/-sigma, ...`, in the format of BicycleParameters (Moore, Hubbard & Kooijman;
+`*Measured.txt`). n readings of one quantity are
 replaced by their mean, with the standard deviation `sqrt(sum sigma^2) / n`. A name consists of quantity, part
 and number: `TtB2` is the twisting period of the rear frame B in its second hanging.
 

@@ -24,9 +24,8 @@ speed. The tests check that C is proportional to v, and that K is affine in v^2.
 Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant
 (Orlando) and discriminant are textbook.
 
-Limits of quantities that depend on the parameters, by a Monte Carlo with the measured standard deviations.
-
-Parameters are drawn from a normal distribution with the measured values and their covariance, or
+`interval` gives limits of quantities that depend on the parameters, by a Monte Carlo method. Parameters are
+drawn from a normal distribution with the measured values and their covariance, or
 independently if the covariance is unknown, as from parameter files. If only some samples have a quantity,
 such as a capsize speed, their fraction is reported, and the limits refer to them.
 """

@@ -6,13 +6,12 @@ Geometric constraints `g(t, q) = 0` enter as `phi = dg/dt`, and keep their posit
 prescribed coordinates, geometric constraints and contact heights, which have a position residual; then
 no-slip and velocity constraints. Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
 
-Kinematics of switching contacts, and of constraints that hold until their force exceeds a limit: gaps,
-speeds, and derivatives.
+Switching contacts, and constraints that hold until their force exceeds a limit, have gaps and speeds:
 
     w = (dg/dt, slip along the tangents)    of each contact with gap g
     w = A u + a,   dw/dt = A udot + drift
 
-Names of the parts of a scene, found by tracing it once, without evaluation at a state.
+The names of the parts of a scene are found by tracing it once, without evaluation at a state.
 """
 
 from collections.abc import Callable

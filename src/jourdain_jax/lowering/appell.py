@@ -9,8 +9,8 @@
 Constraints that are not eliminated are kept (`multipliers.py`). `partial_velocities.py` computes beta, gamma,
 a_0 and alpha_0 by one of two strategies.
 
-Simplify switching contacts by normal forms. Their responses are simplified once; loads, events, resets and
-starts then use the simplified nodes.
+`simplify_contacts` simplifies the responses of switching contacts once, by normal forms; loads, events,
+resets and starts then use the simplified nodes.
 """
 
 from collections.abc import Callable

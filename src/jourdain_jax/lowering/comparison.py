@@ -1,10 +1,8 @@
 """Compare the rates of two programs, or of a program and dense matrices, at probes where both are valid.
 Differences are relative to the typical size of each rate.
 
-Probes are states with parameters. Candidates for a scalar program are compared at the probes made here.
-
-Compute the rates of a scene by dense matrices in NumPy, with JAX's derivatives, as a reference for scalar
-programs.
+`comparison_probes` makes the probes, which are states with parameters. `dense_rates` computes the rates of
+a scene by dense matrices in NumPy, with JAX's derivatives, as a reference for scalar programs:
 
     beta, gamma, A          derivatives of v, omega, phi along each speed
     a_0, alpha_0, drift     derivatives along (1, qdot, 0)
@@ -14,9 +12,9 @@ programs.
 
 Source: Wang and Pao (2003).
 
-Make probes outside the domain, with angles over full turns, because a pivot that is large in the domain
-may vanish at another heading. Speeds satisfy the velocity constraints; otherwise redundant constraints would
-have no solution.
+`full_turns` makes probes outside the domain, with angles over full turns, because a pivot that is large in
+the domain may vanish at another heading. Their speeds satisfy the velocity constraints; otherwise redundant
+constraints would have no solution.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,8 @@
 """Choose pivots to eliminate a linear system of nodes, such that they are large wherever the system itself is
 regular.
 
-A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first.
+A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first,
+unless it vanishes for the given parameters.
 Other pivots are rated by their smallest value over all probes, relative to their row. Among good pivots, the
 one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
 eliminated together if their determinant cannot vanish. For example, the velocity of a hitch in rotated axes

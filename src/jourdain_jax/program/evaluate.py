@@ -2,7 +2,8 @@
 
 The module also extracts the parts of a graph that some nodes need, and compares their sizes.
 
-Analyticity of expressions: an analytic expression that is zero at random states is zero everywhere.
+It also finds which expressions are analytic: an analytic expression that is zero at random states is zero
+everywhere.
 
 Expressions of +, -, *, /, roots, sines and cosines are analytic; branches and opaque calls are not. Functions
 that are constant to round-off over some range do not obey the rule either.

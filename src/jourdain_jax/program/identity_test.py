@@ -12,7 +12,7 @@ from one (1e-24, 1e16) and would dominate or vanish. They are written as c = m R
 between 2^-20 and 2^20, and R is replaced by a random number at every probe: an identity that holds for any R
 holds for 2^40.
 
-Projection of probes on a graph: inputs move by Gauss-Newton until the constraints vanish.
+`onto_rows` projects probes: it moves inputs by Gauss-Newton steps until the constraints vanish.
 """
 
 import math

@@ -1,4 +1,6 @@
-"""Impressed forces: known functions of time, state and parameters, given as resultants on bodies or as
+"""Loads and ready-made constraints.
+
+Loads are impressed forces: known functions of time, state and parameters, given as resultants on bodies or as
 generalized forces on speeds.
 
 A load has forces F at the mass centres (`forces`), torques L (`torques`), and generalized forces Q_k on the

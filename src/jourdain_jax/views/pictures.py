@@ -191,11 +191,8 @@ def animate(
             f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, "
             "or elevation and azimuth in degrees"
         )
-    angles, plt, still = (
-        VIEWS[view] if isinstance(view, str) else view,
-        pyplot(),
-        str(path).lower().endswith(_STILL),
-    )
+    angles, plt = VIEWS[view] if isinstance(view, str) else view, pyplot()
+    still = str(path).lower().endswith(_STILL)
     drawn = looks_of(trajectory) if still else looks_of(trajectory, "animate", frames)
     if paths is None:
         paths = [(name, np.zeros(3)) for name in drawn.bodies if name]
