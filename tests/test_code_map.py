@@ -28,7 +28,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
     "code tokens of tests": 338_173,
-    "code tokens of bench": 108_064,
+    "code tokens of bench": 108_126,
     "test files that reach private names": 34,
 }
 
