@@ -112,7 +112,7 @@ def test_they_are_nan_after_the_failure_right_before_it_and_zero_where_nobody_as
 # parameter by NaN.
 
 
-@pytest.mark.parametrize("ask", [jj.report, jj.verify, jj.energy_balance, jj.sample_states])
+@pytest.mark.parametrize("ask", [jj.report, jj.verify, jj.analysis.energy_balance, jj.sample_states])
 @pytest.mark.parametrize("inside", [jax.jit, jax.vmap, lambda f: lambda x: jax.jvp(f, (x,), (x,))])
 def test_functions_that_need_numbers_say_so_by_name(ask, inside):
     with pytest.raises(
@@ -149,7 +149,7 @@ def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
         lambda x: (
             found.extend(
                 [
-                    jj.energy_balance(wire),
+                    jj.analysis.energy_balance(wire),
                     motion.raise_if_failed().message,
                     jj.sample_states(wire, 1)[1].shape,
                 ]
@@ -157,7 +157,7 @@ def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
             or x
         )
     )(0.5)
-    assert found == [jj.energy_balance(wire), motion.message, (1, 1)]
+    assert found == [jj.analysis.energy_balance(wire), motion.message, (1, 1)]
 
 
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])

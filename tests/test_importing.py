@@ -1,6 +1,7 @@
 """What importing the package does to the process, and what it leaves until it is asked for."""
 
 import ast
+import os
 import pickle
 import subprocess
 import sys
@@ -46,6 +47,68 @@ def test_importing_computes_nothing_and_a_motion_imports_what_it_needs():
     assert done.returncode == 0, done.stderr
 
 
+CONFIGURED = """
+import os
+before = dict(os.environ)
+import jourdain_jax as jj
+import jax
+
+assert dict(os.environ) == before and jax.config.jax_enable_x64
+try:
+    jj.configure(threads=0)
+except ValueError as error:
+    assert "`threads` is `0`, expected a whole number from 1 to 1024" in str(error)
+else:
+    raise AssertionError
+found = jj.configure(threads=3, xla_threads=17)
+loops = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
+assert found == {"JOURDAIN_JAX_THREADS": "3", "PJRT_NPROC": "17", "XLA_FLAGS": loops}
+assert found.items() <= os.environ.items()
+assert jj.configure() == found  # what is set stays
+
+from jourdain_jax.kernels.host import threads
+disc = jj.models.TiltingDisc()
+assert jj.simulate(disc, jj.start(disc, lean=0.3), t1=0.1).result == 0 and threads() == 3
+try:
+    jj.configure()
+except RuntimeError as error:
+    assert "JAX has computed already" in str(error)
+else:
+    raise AssertionError
+assert found.items() <= os.environ.items()
+"""
+BY_DEFAULT = """
+import os
+import jourdain_jax as jj
+import jax.numpy as jnp
+
+before = dict(os.environ)
+if START:
+    jnp.zeros(3)
+jj.Scene
+added = {} if START else {
+    "PJRT_NPROC": str(max(16, os.cpu_count())),
+    "XLA_FLAGS": "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576",
+}
+assert dict(os.environ) == before | added
+"""
+
+
+@pytest.mark.parametrize(
+    "program",
+    [CONFIGURED, BY_DEFAULT.replace("START", "False"), BY_DEFAULT.replace("START", "True")],
+    ids=["configured", "by default", "after JAX has started"],
+)
+def test_the_import_leaves_the_environment_alone_and_configure_says_what_it_sets(program):
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("XLA_FLAGS", "PJRT_NPROC", "NPROC", "JOURDAIN_JAX_THREADS")
+    }
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=kept)
+    assert done.returncode == 0, done.stderr
+
+
 def _imports(package):
     """The module of each name that the stub of a package imports."""
     nodes = ast.walk(ast.parse(Path(package.__file__).with_suffix(".pyi").read_text()))
@@ -80,6 +143,7 @@ def test_public_names_are_there_and_those_that_static_tools_see(package):
         ("Sensor", "identification"),
         ("gibbs_function", "equations"),
         ("Report", "analysis"),
+        ("energy_balance", "analysis"),
     ],
 )
 def test_a_former_name_says_where_it_is(name, place):

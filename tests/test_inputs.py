@@ -209,7 +209,7 @@ def test_lanes_and_gradients_carry_the_work_of_inputs():
 
 def test_potentials_that_depend_on_inputs_are_found_and_named():
     assert jj.structure_of(PulledBead()).potentials_of_inputs == (1,)
-    assert "potentials that depend on inputs" in jj.energy_balance(PulledBead()).changed_by
+    assert "potentials that depend on inputs" in jj.analysis.energy_balance(PulledBead()).changed_by
     assert jj.structure_of(OnBelt()).potentials_of_inputs == ()
 
 

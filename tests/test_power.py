@@ -98,7 +98,7 @@ def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
     ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else "",
 )
 def test_what_changes_the_energy_of_a_scene_is_named(scene, changed_by):
-    balance = jj.energy_balance(scene)
+    balance = jj.analysis.energy_balance(scene)
     assert balance.changed_by == changed_by
     assert balance.conserved == (not changed_by)
 
@@ -156,4 +156,4 @@ def test_work_that_is_left_out_is_no_fault():
 
 
 def test_what_changes_the_mass_is_named():
-    assert jj.energy_balance(TIMED[4][0]).changed_by == ("masses or inertias that change",)
+    assert jj.analysis.energy_balance(TIMED[4][0]).changed_by == ("masses or inertias that change",)

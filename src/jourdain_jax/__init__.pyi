@@ -8,7 +8,8 @@ from .analysis.families.periodic import periodic
 from .analysis.linearize import linearize
 from .analysis.report import report
 from .analysis.steady import steady
-from .analysis.verify import energy, energy_balance, verify
+from .analysis.verify import energy, verify
+from .calculus.configuration import configure
 from .calculus.derivative_errors import DifferentiationModeError
 from .calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z, vec
 from .dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
@@ -130,6 +131,7 @@ __all__ = [
     "build",
     "check",
     "clear_caches",
+    "configure",
     "consistent",
     "coordinates",
     "critical",
@@ -139,7 +141,6 @@ __all__ = [
     "disc_contact",
     "ellipsoid_contact",
     "energy",
-    "energy_balance",
     "equations",
     "family",
     "fit",

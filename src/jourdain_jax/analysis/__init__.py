@@ -10,7 +10,7 @@ from jourdain_jax.analysis.state_space import StateSpace
 from jourdain_jax.analysis.statements import derivative_exists
 from jourdain_jax.analysis.steady import SteadyMotion
 from jourdain_jax.analysis.verification import Verification
-from jourdain_jax.analysis.verify import Energy, EnergyBalance
+from jourdain_jax.analysis.verify import Energy, EnergyBalance, energy_balance
 
 __all__ = [
     "Energy",
@@ -21,4 +21,5 @@ __all__ = [
     "SteadyMotion",
     "Verification",
     "derivative_exists",
+    "energy_balance",
 ]

@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 
+from jourdain_jax.calculus.configuration import MOST_THREADS
 from jourdain_jax.calculus.files import whole_number, write_whole
 
 llvm: Any = None
@@ -42,7 +43,6 @@ _LANES = (("avx512f", 8), ("avx", 4))  # doubles per register; otherwise 2, as o
 # compiles in 0.51 s instead of 0.84 and takes 2.4 us per lane instead of 1.6. 0: fast register allocation;
 # 12,000 sequential operations compile in 0.07 s instead of 0.72 (1) and 1.33 (2), and run at half the speed.
 EFFORT = 2
-MOST_THREADS = 1024  # each thread reserves 8 MB of address space for its stack
 _lock = threading.Lock()
 _engines: list = []  # own the machine code, and live as long as the process, which may call it
 
