@@ -67,7 +67,7 @@ def perturbations(
 
 
 # q (0, ds)/2 = H q ds, by components w, x, y, z of the product and by axes of the rotation
-_HALF_A_TURN = (
+_HALF_A_TURN = (  # numerics
     np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]]
     * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None]
     / 2

@@ -32,7 +32,7 @@ from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.rollout import Rollout, rollout
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
-MAX_SPEED = 50.0  # m/s; higher speeds are treated as nonexistent
+MAX_SPEED = 50.0  # physics, m/s; higher speeds are treated as nonexistent
 CAVEAT = (
     "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is the share "
     "of these samples.\nSigmas of parameter files count as independent, since these contain no covariance; "

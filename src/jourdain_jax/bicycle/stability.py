@@ -50,7 +50,7 @@ from jourdain_jax.calculus.reals import Flag, Scalar, real_type
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
-_SPEED = 4.0  # m/s, of the second linearisation
+_SPEED = 4.0  # physics, m/s: of the second linearisation
 _DEPENDENT = ("pitch",)
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]

@@ -15,7 +15,7 @@ import jax
 
 from jourdain_jax.calculus.files import whole_number
 
-MOST_THREADS = 1024  # each thread reserves 8 MB of address space for its stack
+MOST_THREADS = 1024  # tuning: each thread reserves 8 MB of address space for its stack
 _POOL = ("PJRT_NPROC", "NPROC")
 _LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
 

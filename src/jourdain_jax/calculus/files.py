@@ -21,7 +21,7 @@ from typing import BinaryIO
 from jourdain_jax.calculus.reals import described
 
 FilePath = str | os.PathLike
-DEEPEST = 250  # maximum nesting depth: bodies of a chain, as elements of MJCF
+DEEPEST = 250  # tuning: nesting depth of elements: bodies of a chain, in MJCF
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE
 )

@@ -211,8 +211,8 @@ def first_root(
     )[1:]
 
 
-QUIET = 2  # number of steps without change after which the iteration has settled
-ROUND_OFF = 1e3  # a change is larger than this many eps, relative to 1 + |x|
+QUIET = 2  # numerics: number of steps without change after which the iteration has settled
+ROUND_OFF = 1e3  # numerics: a change is larger than this many eps, relative to 1 + |x|
 
 
 def fixed_point(

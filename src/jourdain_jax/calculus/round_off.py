@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 EPS = float(np.finfo(float).eps)
-LOST = 1e3  # a divisor or radicand smaller than this many bounds may be zero
+LOST = 1e3  # numerics: a divisor or radicand smaller than this many bounds may be zero
 
 
 def with_bound(value: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from jourdain_jax.cli.sweep_verbs import add as add_sweep_verb
 from jourdain_jax.scene.coordinates import nearest
 from jourdain_jax.studies.records import InUseError
 
-OK, FAILED, USAGE = 0, 1, 2
+OK, FAILED, USAGE = 0, 1, 2  # code
 VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")
 
 

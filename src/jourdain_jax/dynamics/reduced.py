@@ -38,7 +38,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.sampling import sample_states
 from jourdain_jax.structure.structure import structure_of
 
-DEPENDS = 1e-9  # relative change of a quantity above which it depends on the coordinate
+DEPENDS = 1e-9  # numerics: relative change of a quantity above which it depends on the coordinate
 
 
 class AdmissibleRates(eqx.Module):

@@ -24,11 +24,11 @@ from jourdain_jax.calculus.reals import ContactFlags, ContactVectors, Flag, PerC
 
 # SWEEPS: Gauss-Seidel sweeps per contact; STEPS: Newton steps for one contact, one more for each
 # further contact
-SWEEPS, STEPS = 4, 5
-SLOW = 5e-6  # m/s: slower slip changes its direction as if it had this speed
-ROUND_OFF = 1e-9  # relative, of responses
-LEAST_SLIP = 1e-8  # m/s: round-off of speeds that impulses change
-LEAST_PIVOT = 1e-12  # relative to the diagonal entry before elimination
+SWEEPS, STEPS = 4, 5  # numerics
+SLOW = 5e-6  # numerics, m/s: slower slip changes its direction as if it had this speed
+ROUND_OFF = 1e-9  # numerics: relative, of responses
+LEAST_SLIP = 1e-8  # numerics, m/s: round-off of speeds that impulses change
+LEAST_PIVOT = 1e-12  # numerics: relative to the diagonal entry before elimination
 
 
 def solved(

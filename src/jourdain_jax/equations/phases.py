@@ -84,7 +84,7 @@ from jourdain_jax.scene.modes import (
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
-FLAT_BELOW = 1e-8  # squared sine of the lean below which a disc counts as flat
+FLAT_BELOW = 1e-8  # physics: squared sine of the lean below which a disc counts as flat
 
 
 class At:
@@ -150,7 +150,7 @@ def switched(scene: Scene, motion: Motion, numbers: PerContact, q, u) -> Motion:
     return motion_at(scene, motion.t, q, u, inputs)
 
 
-LEAST_REBOUND = 1e-6  # m/s: below this speed of rebound a contact closes
+LEAST_REBOUND = 1e-6  # physics, m/s: below this speed of rebound a contact closes
 
 
 class Changes(NamedTuple):
@@ -241,10 +241,11 @@ class After:
 
 
 # least share of the ground's response that friction must leave; it is zero at Painleve's paradox
-NEARLY = 1e-4
-STOPS = 1e-13  # m/s: slip ends at this speed against its direction; larger than the round-off when it starts
-SAME = 1e-12  # m: a contact that closes within this gap strikes together with another
-TOUCHES = 1e-8  # m: a gap below this counts as closed at the start
+NEARLY = 1e-4  # numerics
+# numerics, m/s: slip ends at this speed against its direction; larger than the round-off when it starts
+STOPS = 1e-13
+SAME = 1e-12  # numerics, m: a contact that closes within this gap strikes together with another
+TOUCHES = 1e-8  # numerics, m: a gap below this counts as closed at the start
 
 
 def contact_events(at: At) -> dict[str, Scalar]:

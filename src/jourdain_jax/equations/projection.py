@@ -133,7 +133,7 @@ def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
     return Change(x, K), Change(dx, jnp.zeros_like(K))
 
 
-MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8
+MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8  # numerics
 
 
 class RowFunctions(NamedTuple):

@@ -94,8 +94,8 @@ def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledPro
 
 # Least pivot of the scaled A_z. Round-off grows as the inverse square of the pivot: at 1e-2, accelerations
 # agree to 1e-12 with the other reductions.
-APPLICABLE_PIVOT = 1e-2
-SMALLEST_PIVOT = 1e-3  # least pivot for independent speeds as the state of a simulation
+APPLICABLE_PIVOT = 1e-2  # numerics
+SMALLEST_PIVOT = 1e-3  # numerics: least pivot for independent speeds as the state of a simulation
 
 
 class Reduction(eqx.Module):

@@ -25,8 +25,8 @@ from jourdain_jax.calculus.reals import all_finite, largest
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
-_STATES, _TRIES = 3, 40  # number of random states that are compared, and limit of tried states
-_STEP = 1e-6  # of finite differences
+_STATES, _TRIES = 3, 40  # numerics: number of random states that are compared, and limit of tried states
+_STEP = 1e-6  # numerics: of finite differences
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _meeting(
     return dict(zip(speeds, map(float, u), strict=True))
 
 
-_SAME = 1e-6  # relative tolerance of equal velocities
+_SAME = 1e-6  # numerics: relative tolerance of equal velocities
 
 
 @dataclass(frozen=True)

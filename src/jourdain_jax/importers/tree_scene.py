@@ -25,8 +25,8 @@ from jourdain_jax.scene.coordinates import (
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
 from jourdain_jax.scene.scene import Scene
 
-ROUNDED = 0.05  # tolerance, times the largest moment of inertia: some are published with two digits
-POINT = 1e-6**2  # m^2: moments of a smaller squared radius of gyration are round-off
+ROUNDED = 0.05  # physics: tolerance, times the largest moment of inertia: some are published with two digits
+POINT = 1e-6**2  # physics, m^2: moments of a smaller squared radius of gyration are round-off
 
 Frame = tuple[Matrix3, Vector3]  # orientation and origin in the inertial frame
 

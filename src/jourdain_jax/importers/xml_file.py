@@ -20,7 +20,7 @@ from jourdain_jax.scene.arguments import warn
 from jourdain_jax.scene.coordinates import Labels, as_labels, check_name, nearest
 
 Element = ElementTree.Element
-LARGEST = 100_000_000  # bytes of the largest permitted file
+LARGEST = 100_000_000  # tuning: bytes of the largest permitted file
 
 
 @dataclass(frozen=True)

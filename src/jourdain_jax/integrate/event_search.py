@@ -54,9 +54,9 @@ from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_ro
 from jourdain_jax.integrate.loop.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
 from jourdain_jax.integrate.relation_sides import leaving, on_their_way
 
-RUNNING, LOCATING = -1, -2  # codes of a running motion, and of one that locates an event
-MOST_STEPS = 72
-DIFFERENTIABLE = 2
+RUNNING, LOCATING = -1, -2  # code: a running motion, and one that locates an event
+MOST_STEPS = 72  # numerics
+DIFFERENTIABLE = 2  # numerics
 
 
 def _each(w, condition, a: Values, b: Values) -> tuple:

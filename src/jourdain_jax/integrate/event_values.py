@@ -9,9 +9,9 @@ from functools import reduce
 from typing import Any
 
 # a value whose rate at zero is less than this part of its mean rate counts as a multiple root
-FLAT = 1e-8
-LEAVES = 0.6  # exponent of round-off, in the noise of times
-LATE = 0.98  # fraction of a step; the next step finds later dips
+FLAT = 1e-8  # numerics
+LEAVES = 0.6  # numerics: exponent of round-off, in the noise of times
+LATE = 0.98  # numerics: fraction of a step; the next step finds later dips
 Values = Any  # one per event
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 else:
     diffrax = module_on_first_use("diffrax")
 
-SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0  # tuning
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def off(where: Callable, magnitude: Callable, x, rtol, atol):
     return x + where(x < 0.0, -1.0, 1.0) * (atol + rtol * magnitude(x))
 
 
-LEAST_ORDER, MOST_ORDER = 4, 30
+LEAST_ORDER, MOST_ORDER = 4, 30  # tuning
 
 
 class Taylor(eqx.Module):

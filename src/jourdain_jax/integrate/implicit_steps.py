@@ -109,10 +109,10 @@ _NODES = np.array([(4 - np.sqrt(6)) / 10, (4 + np.sqrt(6)) / 10, 1.0])
 _POWERS = np.arange(1, 4)
 # collocation: sum_j a_ij c_j^(k-1) = c_i^k / k for k = 1, 2, 3
 _A = np.linalg.solve((_NODES[:, None] ** (_POWERS - 1)).T, (_NODES[:, None] ** _POWERS / _POWERS).T).T
-_REAL = 1 / next(
+_REAL = 1 / next(  # numerics
     float(value.real) for value in np.linalg.eigvals(np.linalg.inv(_A)) if abs(value.imag) < 1e-6
 )
-_ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1.0])
+_ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1.0])  # numerics
 
 
 class RadauIIA(ImplicitMethod):

@@ -15,20 +15,20 @@ Codes up to `EVENT` mark motions that reached the end of their span or an event;
     BAD_START,
     UNSOLVED_STEP,
 ) = range(10)
-SHRANK = 10
-STIFF = 11
-OFF_CONSTRAINTS = 12
-BAD_TIMES = 13
-ENERGY_LOST = 14
-PROCESS_DIED = 15
-CONTRADICTORY_ROWS = 16
-UNRESOLVED = 17
-TOO_MANY_TRANSITIONS = 18
-IMPACT_GAINS_ENERGY = 19
-PAINLEVE = 20
-CONTACTS_UNDECIDED = 21
-LIES_FLAT = 22
-STICKS = 23
+SHRANK = 10  # code
+STIFF = 11  # code
+OFF_CONSTRAINTS = 12  # code
+BAD_TIMES = 13  # code
+ENERGY_LOST = 14  # code
+PROCESS_DIED = 15  # code
+CONTRADICTORY_ROWS = 16  # code
+UNRESOLVED = 17  # code
+TOO_MANY_TRANSITIONS = 18  # code
+IMPACT_GAINS_ENERGY = 19  # code
+PAINLEVE = 20  # code
+CONTACTS_UNDECIDED = 21  # code
+LIES_FLAT = 22  # code
+STICKS = 23  # code
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 
 MESSAGES = {
@@ -126,7 +126,7 @@ MESSAGES = {
 }
 
 # Retries after a failure, with `retry=True`. `Trajectory.fallback` is their sum.
-AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
+AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2  # code
 FALLBACKS = {
     AS_ASKED: "",
     FULL_STATE: (

@@ -24,8 +24,8 @@ from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference
 
-MEMORY = 2**32  # bytes, unless a model sets a limit
-LONGEST = 1 / 16  # default of the longest step, relative to the span
+MEMORY = 2**32  # tuning: bytes, unless a model sets a limit
+LONGEST = 1 / 16  # numerics: default of the longest step, relative to the span
 
 
 class Passed(eqx.Module):

@@ -45,7 +45,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import elsewhere, faults_at
 from jourdain_jax.structure.structure import Structure
 
-OFF = 1e4  # a residual above this many eps is more than round-off
+OFF = 1e4  # numerics: a residual above this many eps is more than round-off
 
 
 class State(Printed, eqx.Module):

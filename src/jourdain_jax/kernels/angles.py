@@ -75,12 +75,14 @@ def quotient(w: Writer, a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     return q, (product_less(w, q, b[0], a[0]) + (q * b[1] - a[1])) * inverse
 
 
-WHOLE = 1.5 * 2.0**52  # adding this rounds to an integer, held in the last bits of the sum
-LARGEST_ANGLE = 5e5  # rad; products of a part of 33 bits and a multiple of pi/2 below 2^20 are exact
-_HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
+WHOLE = 1.5 * 2.0**52  # numerics: adding this rounds to an integer, held in the last bits of the sum
+# numerics, rad; products of a part of 33 bits and a multiple of pi/2 below 2^20 are exact
+LARGEST_ANGLE = 5e5
+_HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # numerics
 _LESS_SINE = tuple(-c for c in SINE)
-_PI = (3.1415926535897896, 3.675178358715236e-15)  # the head has 50 bits, so 1/4, 1/2 and 3/4 of it are exact
-ATAN = (
+# numerics: the head has 50 bits, so 1/4, 1/2 and 3/4 of it are exact
+_PI = (3.1415926535897896, 3.675178358715236e-15)
+ATAN = (  # numerics
     0.016285756855221028,
     -0.034570561981427744,
     0.04551593220626549,
@@ -94,7 +96,7 @@ ATAN = (
     0.19999999999999804,
     -0.3333333333333333,
 )
-ASIN = (
+ASIN = (  # numerics
     0.028757851367421566,
     -0.014851887071247204,
     0.01740087944269402,

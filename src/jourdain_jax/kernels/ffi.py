@@ -27,7 +27,8 @@ from jourdain_jax.kernels.ir import Writer
 from jourdain_jax.kernels.ir_value import Value
 
 HANDLER, KERNEL = "handler", "kernel"
-WORDS, MOST_BUFFERS = 4, 16  # words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays
+# tuning: words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays
+WORDS, MOST_BUFFERS = 4, 16
 _LAYOUTS = {
     "CallFrame": "api ctx stage args rets attrs future",
     "Buffer": "dtype data rank dims",
@@ -42,7 +43,7 @@ _LAYOUTS = {
 # functions called here, by their place in the interface
 FUNCTIONS = {0: "Error_Create", 4: "Stream_Get", 9: "DeviceMemory_Allocate", 10: "DeviceMemory_Free"}
 # word indices of 8 bytes
-ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
+ARGS, RETS = 9, 14  # code: of a frame: its lists of pointers to arguments and results
 
 _REGISTERED: set[str] = set()  # names of handlers
 _REGISTERING = threading.Lock()

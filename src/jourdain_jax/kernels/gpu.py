@@ -28,7 +28,7 @@ from jourdain_jax.kernels.ir import Writer
 from jourdain_jax.kernels.ir_value import Value
 
 _TARGET = "jourdain_jax_on_gpu"
-MOST_KERNELS = 4096  # per process
+MOST_KERNELS = 4096  # tuning: per process
 _NUMBER, _FUNCTION, _WORDS = range(3)  # word indices of a table entry, and number of words
 # words of the interface
 _CREATE_ERROR, _GET_STREAM, _ALLOCATE, _FREE = (6 + place for place in ffi.FUNCTIONS)

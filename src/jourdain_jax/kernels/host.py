@@ -42,7 +42,7 @@ _LANES = (("avx512f", 8), ("avx", 4))  # doubles per register; otherwise 2, as o
 # 2: full optimisation, for code that runs often. 1: few passes; projection of the speeds of a bicycle
 # compiles in 0.51 s instead of 0.84 and takes 2.4 us per lane instead of 1.6. 0: fast register allocation;
 # 12,000 sequential operations compile in 0.07 s instead of 0.72 (1) and 1.33 (2), and run at half the speed.
-EFFORT = 2
+EFFORT = 2  # tuning
 _lock = threading.Lock()
 _engines: list = []  # own the machine code, and live as long as the process, which may call it
 
@@ -161,8 +161,8 @@ def address(code: bytes, name: str) -> int:
         return engine.get_function_address(name)
 
 
-MOST_BYTES = 200e6  # of all files; beyond, the oldest are deleted
-_DIGEST = 32  # bytes
+MOST_BYTES = 200e6  # tuning: of all files; beyond, the oldest are deleted
+_DIGEST = 32  # code: bytes
 
 
 def folder() -> Path | None:

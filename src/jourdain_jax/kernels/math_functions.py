@@ -25,9 +25,9 @@ from jourdain_jax.kernels.ir import Writer
 from jourdain_jax.kernels.ir_value import Value
 
 DoubleDouble = angles.DoubleDouble
-_LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # the first has 32 bits
-_THIRD = (1 / 3, 1.850371707708594e-17)
-EXP = (
+_LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # numerics: the first has 32 bits
+_THIRD = (1 / 3, 1.850371707708594e-17)  # numerics
+EXP = (  # numerics
     2.0914679376583935e-09,
     2.510520637395701e-08,
     2.7557273661348637e-07,
@@ -40,7 +40,7 @@ EXP = (
     0.1666666666666667,
     0.5,
 )
-LOG = (
+LOG = (  # numerics
     0.057831251398003526,
     0.058609104507519154,
     0.0666710089052775,

@@ -15,7 +15,7 @@ import jax
 from jourdain_jax.kernels import host
 
 TRIPLE = "nvptx64-nvidia-cuda"
-WARP = 32
+WARP = 32  # code
 CALLED_BY_HANDLER = (
     "cuGetErrorString",
     "cuLaunchKernel",

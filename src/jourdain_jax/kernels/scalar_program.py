@@ -75,8 +75,9 @@ def turns(
 # Number of operations above which registers are allocated here instead of by LLVM. Measured: limits from 100
 # to 500 make no difference; rates of a bicycle (2,115) take 10 % less time than by LLVM, their cotangents 25
 # %.
-LONG = 200
-REACH = 128  # rows on either side of a pointer that a one-byte displacement reaches, with wide registers
+LONG = 200  # tuning
+# tuning: rows on either side of a pointer that a one-byte displacement reaches, with wide registers
+REACH = 128
 
 _TRUTHS = {"and": "and", "or": "or"}
 

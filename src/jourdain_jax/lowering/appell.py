@@ -31,7 +31,7 @@ from jourdain_jax.structure.probes import generic_states
 from jourdain_jax.structure.structure import Structure
 from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
 
-MOST_TERMS = (8, 60)  # term limits to try
+MOST_TERMS = (8, 60)  # tuning: term limits to try
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:

@@ -14,7 +14,7 @@ from jourdain_jax.program.derivative import cotangents, on_its_own
 from jourdain_jax.program.identity_test import SURE, alike, equal, taken_for_what_they_are
 from jourdain_jax.scene.scene import Scene
 
-FEW = 6  # number of probes that suffices to test most coordinates
+FEW = 6  # numerics: number of probes that suffices to test most coordinates
 
 
 def _with_slopes(

@@ -45,8 +45,8 @@ from jourdain_jax.structure.trace import Variables, named_values, traced_scene
 # larger programs are faster, too: a quadruped of 20,550 operations takes 11 s of processor time to the first
 # motion (dense matrices 50 s), then 0.02 s (5.5 s). Machine code is limited to 60,000 operations, integration
 # steps included.
-MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
-MOST_TERMS = 200  # maximum number of terms of one normal form
+MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000  # tuning
+MOST_TERMS = 200  # tuning: maximum number of terms of one normal form
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:

@@ -29,8 +29,9 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
 
-GOOD = 0.02  # smallest acceptable pivot, relative to its row, at the worst probe
-FEW = 12  # for at most this number of equations, the choice of a pivot depends on its number of operations
+GOOD = 0.02  # numerics: smallest acceptable pivot, relative to its row, at the worst probe
+# tuning: for at most this number of equations, the choice of a pivot depends on its number of operations
+FEW = 12
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,15 @@ from jourdain_jax.calculus.reals import Indices
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, NodeList
 
-MOST_WATCHED = 32  # maximum number of monitored relations of a scene
+MOST_WATCHED = 32  # tuning: maximum number of monitored relations of a scene
 # values of comparisons if a > b, and if a < b
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}
 EQUAL = {"eq": (False, False), "ne": (True, True)}  # not monitored, unless the number also decides others
 COMPARED |= EQUAL
 # distance from a zero, relative to the distance of two probes; tolerance, relative to the size of a rate
-ASIDE, AGREE = 1e-5, 1e-7
-DECISIONS = 512  # maximum number of decisions of other relations at each zero; if there are more, random ones
+ASIDE, AGREE = 1e-5, 1e-7  # numerics
+# numerics: maximum number of decisions of other relations at each zero; if there are more, random ones
+DECISIONS = 512
 Decided = dict[int, list[tuple[int, int]]]  # result of `switches`
 WHOLE = ("floor", "ceil", "round", "rem")
 

@@ -41,7 +41,7 @@ def step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
     )
 
 
-MOST_STEP_ERRORS = 10  # largest drift, as a multiple of the errors of N steps at the tolerance
+MOST_STEP_ERRORS = 10  # numerics: largest drift, as a multiple of the errors of N steps at the tolerance
 
 
 def conserves(setup: Setup) -> bool:

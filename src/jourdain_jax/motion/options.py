@@ -28,7 +28,7 @@ from jourdain_jax.scene.coordinates import nearest
 if TYPE_CHECKING:
     from jourdain_jax.integrate.vector_fields.field import Formulation
 
-TOLERANCE, MOST_STEPS = 1e-8, 100_000
+TOLERANCE, MOST_STEPS = 1e-8, 100_000  # numerics
 
 
 @dataclass(frozen=True)

@@ -249,7 +249,7 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
-DEFAULT_SAMPLES = 201
+DEFAULT_SAMPLES = 201  # tuning
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 
 

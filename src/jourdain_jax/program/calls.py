@@ -192,7 +192,7 @@ def _of_jaxpr(x) -> Hashable:
     return *lines, tuple(map(atom, x.outvars))
 
 
-LARGEST = 4096  # maximum number of entries of an array of scalars
+LARGEST = 4096  # tuning: maximum number of entries of an array of scalars
 
 
 class _Variable:

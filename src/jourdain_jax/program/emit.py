@@ -69,8 +69,8 @@ mlir.register_lowering(fused_p, mlir.lower_fun(_reduced_with_zeros, multiple_res
 
 # longest chain of operations in a program without pieces; measured: pieces make chains of links and trailers
 # faster from a length of 100 to 250 on, but the bicycle (102) a quarter slower
-DEEP = 120
-PIECE = 128  # operations
+DEEP = 120  # tuning
+PIECE = 128  # tuning: operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
@@ -154,8 +154,8 @@ def _fused_by_shape(nodes: NodeList, values: Mapping[int, jax.Array]) -> dict[in
 FUNCTIONS: dict[str, Callable] = {name: operation.in_jax for name, operation in TABLE.items()}
 
 # pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (by K. C. Ng, as in FreeBSD's libm)
-HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-SINE = (
+HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)  # numerics
+SINE = (  # numerics
     1.58969099521155010221e-10,
     -2.50507602534068634195e-08,
     2.75573137070700676789e-06,
@@ -163,7 +163,7 @@ SINE = (
     8.33333333332248946124e-03,
     -1.66666666666666324348e-01,
 )
-COSINE = (
+COSINE = (  # numerics
     -1.13596475577881948265e-11,
     2.08757232129817482790e-09,
     -2.75573143513906633035e-07,

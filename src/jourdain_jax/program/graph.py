@@ -15,9 +15,9 @@ import numpy as np
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 
-MOST_NODES = 500_000  # limit of one graph, which takes seconds to build
+MOST_NODES = 500_000  # tuning: limit of one graph, which takes seconds to build
 # limit of one expanded matrix product; measured in batches: scalars win at 16 x 16, calls from 24 x 24 on
-MOST_MULTIPLICATIONS = 512
+MOST_MULTIPLICATIONS = 512  # tuning
 ARRAYS = {"array", "opaque", "output"}  # operations whose values are not scalars (`calls.py`)
 NodeList = list[int]  # node indices
 _GROWING = threading.Lock()  # lock, because threads may extend one graph

@@ -85,9 +85,9 @@ def _slopes_by_entries(
     return pattern, [slope for *_, slope in entries]
 
 
-DIGITS = 40  # bits spanned by the constants in the code of a scene before they are rescaled
-SURE = 16.0  # equal values may differ by this many bounds, because bounds are first-order
-FEWEST = 6  # minimum number of probes with finite values
+DIGITS = 40  # numerics: bits spanned by the constants in the code of a scene before they are rescaled
+SURE = 16.0  # numerics: equal values may differ by this many bounds, because bounds are first-order
+FEWEST = 6  # numerics: minimum number of probes with finite values
 
 
 _KEPT: Mapping[str, float] = MappingProxyType({})

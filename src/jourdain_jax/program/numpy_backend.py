@@ -15,7 +15,7 @@ from jourdain_jax.calculus.markers import MAPS
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.program.entry_places import gathered, scattered
 
-MOST_TURNS = 5000  # iteration limit of a `while_loop`, beyond which it counts as endless
+MOST_TURNS = 5000  # tuning: iteration limit of a `while_loop`, beyond which it counts as endless
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
 
 

@@ -116,7 +116,7 @@ class Event:
 
 FLIES, ROLLS, SLIPS, CREEPS = range(4)
 # values of a mode that tell why a motion cannot continue
-GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4
+GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4  # code
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # a constraint never flies
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")

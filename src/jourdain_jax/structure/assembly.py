@@ -19,7 +19,7 @@ from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
 
-ENOUGH = 8  # this number of random states inside the domain suffices
+ENOUGH = 8  # numerics: this number of random states inside the domain suffices
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,8 @@ def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarr
 
 
 # Default domain: angles reach every direction, so that a partition that is singular somewhere is found.
-COORDINATE_DOMAIN = (-3.2, 3.2)
-SPEED_DOMAIN = (-1.0, 1.0)
+COORDINATE_DOMAIN = (-3.2, 3.2)  # physics
+SPEED_DOMAIN = (-1.0, 1.0)  # physics
 
 
 def coordinate_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

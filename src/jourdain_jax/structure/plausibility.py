@@ -35,7 +35,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.assembly import random_states
 from jourdain_jax.structure.scene_numbers import Numbers, numbers_of, stated_of
 
-TOLERANCE = 1e-4  # relative: covers rounded constants, while mistakes are larger
+TOLERANCE = 1e-4  # physics: relative: covers rounded constants, while mistakes are larger
 _ROWS_INSTEAD = (
     "state it in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 )

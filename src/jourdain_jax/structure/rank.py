@@ -229,7 +229,7 @@ def pivot_columns(A: np.ndarray, rank: int) -> Indices:
     return tuple(sorted(chosen))
 
 
-RANDOM_PROBES = 24
+RANDOM_PROBES = 24  # numerics
 
 
 def moves(rates: np.ndarray) -> bool:

@@ -16,8 +16,8 @@ from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.assembly import ENOUGH, Assembled, coordinate_bounds, random_states
 from jourdain_jax.structure.probes import Probed, sampled_on_graph
 
-GUESSES = 8  # guesses of a start, of each kind
-NEARLY_INSIDE = 0.05  # in widths of the domain
+GUESSES = 8  # tuning: guesses of a start, of each kind
+NEARLY_INSIDE = 0.05  # numerics: in widths of the domain
 NOWHERE_FINITE = (
     "; no constraint is finite anywhere: a contact has no point if a ball is larger than its "
     "hollow cylinder or sphere, or if the gradient of a surface vanishes"

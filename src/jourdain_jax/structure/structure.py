@@ -46,7 +46,7 @@ from jourdain_jax.structure.rank import (
 from jourdain_jax.structure.sampling import drawn_states, no_numbers, usable_states
 from jourdain_jax.structure.smoothness import kinks
 
-WELL_CONDITIONED = 0.02  # least `worst_pivot` for which the minimal state is the default
+WELL_CONDITIONED = 0.02  # numerics: least `worst_pivot` for which the minimal state is the default
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from jourdain_jax.calculus.reals import Count, Scalar, described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 
 Values = Float[Array, "times"]
-FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # number of values that determine a polynomial
+FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # numerics: number of values that determine a polynomial
 
 
 def sampled(

@@ -153,8 +153,8 @@ class Levels:
 
 
 GRID, TABLE = "grid", "table"
-MOST_SAMPLES = 2**53  # integers that floats represent exactly
-MOST_CROSSED = 2**62  # samples of a grid, counted in 64 bits
+MOST_SAMPLES = 2**53  # numerics: integers that floats represent exactly
+MOST_CROSSED = 2**62  # numerics: samples of a grid, counted in 64 bits
 
 
 @dataclass(frozen=True, repr=False)

@@ -16,9 +16,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-COMPILED = 500e6  # bytes for compilers and compiled programs; the disc takes 220 MB, the bicycle 400 MB
-BLOCKS = 4.0  # simultaneous copies of a block's states; measured: 3.7
-CHUNKS = 2.0  # the arrays of a chunk's blocks, and their concatenation
+# tuning: bytes for compilers and compiled programs; the disc takes 220 MB, the bicycle 400 MB
+COMPILED = 500e6
+BLOCKS = 4.0  # tuning: simultaneous copies of a block's states; measured: 3.7
+CHUNKS = 2.0  # tuning: the arrays of a chunk's blocks, and their concatenation
 _NOT_HERE = "`memory` is limited only on Linux with glibc; omit it here"
 
 

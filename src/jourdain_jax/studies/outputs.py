@@ -245,7 +245,8 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
     return found
 
 
-LARGEST_BLOCK = 2048  # samples: one slow sample costs little, and a block takes a fraction of a second
+# tuning, samples: one slow sample costs little, and a block takes a fraction of a second
+LARGEST_BLOCK = 2048
 AT_START = "_at_start"  # suffix of columns of start values, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files next to the arrays
 SAVES = ("statistics", "outputs")

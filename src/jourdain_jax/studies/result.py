@@ -21,7 +21,7 @@ from jourdain_jax.studies.outputs import Task
 from jourdain_jax.studies.statistics import Grid, SobolIndices, Statistics, Tally, combined, sobol_indices
 from jourdain_jax.studies.store import Store
 
-LEVELS = (0.025, 0.5, 0.975)
+LEVELS = (0.025, 0.5, 0.975)  # tuning
 
 
 @dataclass(frozen=True, repr=False)

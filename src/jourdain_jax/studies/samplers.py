@@ -32,17 +32,17 @@ import numpy as np
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
 
 # log 2 in two parts; the product of the first and an integer is exact
-_LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-_LOG = (
+_LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # numerics
+_LOG = (  # numerics
     1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01, 2.222219843214978396e-01,
     2.857142874366239149e-01,
     3.999999999940941908e-01, 6.666666666666735130e-01,
 )  # fmt: skip
-_EXP = (
+_EXP = (  # numerics
     4.13813679705723846039e-08, -1.65339022054652515390e-06, 6.61375632143793436117e-05,
     -2.77777777770155933842e-03, 1.66666666666666019037e-01,
 )  # fmt: skip
-_TAIL, _ROOT = 0.13533528323661269189, 2.50662827463100050242  # exp(-2), sqrt(2 pi)
+_TAIL, _ROOT = 0.13533528323661269189, 2.50662827463100050242  # numerics: exp(-2), sqrt(2 pi)
 _MIDDLE = (
     (-5.99633501014107895267e1, 9.80010754185999661536e1, -5.66762857469070293439e1,
      1.39312609387279679503e1, -1.23916583867381258016e0),
@@ -199,11 +199,11 @@ def normal_quantile(u):
 
 
 qmc = module_on_first_use("scipy.stats.qmc")
-MOST_SOBOL = 2**30  # points of the 30-bit sequence
+MOST_SOBOL = 2**30  # numerics: points of the 30-bit sequence
 _M1, _M2, _GOLDEN = (np.uint64(x) for x in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0x9E3779B97F4A7C15))
 # factors of Philox, and increments of its key after each round
 _F1, _F2 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
-_STEPS = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
+_STEPS = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B  # numerics
 
 
 def _mixed(x):

@@ -37,7 +37,7 @@ from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.integrate.result_codes import CODES, EVENT, SUCCESS
 from jourdain_jax.scene.printing import Printed
 
-CELLS = 4096
+CELLS = 4096  # tuning
 
 
 @dataclass(frozen=True)

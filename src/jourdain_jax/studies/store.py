@@ -44,8 +44,8 @@ from jourdain_jax.studies.records import (
 )
 from jourdain_jax.studies.statistics import Tally
 
-FORMAT = 2
-MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # chunks of a study, samples of a chunk
+FORMAT = 2  # code
+MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # tuning: chunks of a study, samples of a chunk
 
 
 @dataclass(frozen=True)

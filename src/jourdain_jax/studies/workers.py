@@ -30,7 +30,7 @@ from jourdain_jax.studies.outputs import Task
 from jourdain_jax.studies.run import Runner
 from jourdain_jax.studies.store import Store
 
-MOST_DEATHS = 3  # deaths of processes on one chunk before it is omitted
+MOST_DEATHS = 3  # tuning: deaths of processes on one chunk before it is omitted
 _NONE_BEGAN = (
     "no worker of this study could start; see its printed error. Each imports the main program: run studies "
     "in it under `if __name__ == '__main__':`, and define scenes and outputs in a module; or take processes=1"

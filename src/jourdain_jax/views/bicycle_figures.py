@@ -12,7 +12,7 @@ from jourdain_jax.views.quantities import plot
 
 # columns of the eigenvalues; weave is a complex pair, or two real eigenvalues below the double root
 _MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("weave", (2, 3), "tab:blue"))
-_CEILING = 12.0  # 1/s; castering falls far below the range of interest
+_CEILING = 12.0  # physics, 1/s; castering falls far below the range of interest
 
 
 def draw_eigenvalues(study: Study, path: FilePath) -> None:

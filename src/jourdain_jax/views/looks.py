@@ -225,7 +225,7 @@ def _of_inertia(body: RigidBody) -> list[Visual]:
     return [Visual.box(sides, turn=axes)]
 
 
-_CELLS = 48  # mesh cells along each of the two surface parameters
+_CELLS = 48  # tuning: mesh cells along each of the two surface parameters
 
 
 def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.ndarray) -> list[dict]:

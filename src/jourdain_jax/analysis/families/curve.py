@@ -19,7 +19,7 @@ from jourdain_jax.scene.coordinates import parameters_of
 Targets = list[tuple[int, float]]  # indices of unknowns, and their values at which a curve ends
 CLOSED = "the curve is closed"
 # length of steps, in units of the unknowns' sizes; far from the origin LONGEST is relative to the distance
-LONGEST, SHORTEST = 0.1, 1e-8
+LONGEST, SHORTEST = 0.1, 1e-8  # tuning
 
 
 @dataclass(frozen=True)

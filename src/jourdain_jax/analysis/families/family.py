@@ -35,7 +35,7 @@ from jourdain_jax.scene.coordinates import (
 from jourdain_jax.scene.printing import Printed, complex_numbers, in_digits, table
 from jourdain_jax.scene.scene import Scene
 
-SHOWN = 1e-9  # an unknown is printed if its change, in units of its size, exceeds this number
+SHOWN = 1e-9  # numerics: an unknown is printed if its change, in units of its size, exceeds this number
 
 
 @dataclass(frozen=True, repr=False, eq=False)

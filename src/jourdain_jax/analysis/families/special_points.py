@@ -31,7 +31,7 @@ from jourdain_jax.analysis.families.curve import (
 from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector, are_partners
 from jourdain_jax.calculus.reals import all_finite, largest
 
-SURE = 1e-7  # real parts and differences of eigenvalues above SURE (1 + |s|) are not round-off
+SURE = 1e-7  # numerics: real parts and differences of eigenvalues above SURE (1 + |s|) are not round-off
 
 
 @dataclass(frozen=True)

@@ -247,7 +247,7 @@ def _determined(scene: Scene) -> dict[str, bool]:
     }
 
 
-LATEST = 4.0  # times the observed time: the latest permitted time of the simulated event
+LATEST = 4.0  # numerics: in observed times, the latest permitted time of the simulated event
 
 
 class StopEvent(eqx.Module):

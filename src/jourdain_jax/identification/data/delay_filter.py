@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Entries, array_module, is_traced, real_type
 
-FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
+FEWEST_INTERVALS = 64  # numerics: up to the end of a run, or to the next node of a piece
 Times = Float[Entries, "times"]
 Knots = Float[Array, "knots"]
 
@@ -57,11 +57,11 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Entries, "grid"]:
     return xp.where(xp.arange(count + 1) == until, end, found)  # without round-off at this time
 
 
-POINTS = 6  # grid points that determine a polynomial
-_MIDDLE = (POINTS - 1) / 2
+POINTS = 6  # numerics: grid points that determine a polynomial
+_MIDDLE = (POINTS - 1) / 2  # numerics
 # values -> coefficients, highest power first
 _COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE))
-_LEAST = 1e-3  # lower limit of rho in exp(-s / rho)
+_LEAST = 1e-3  # numerics: lower limit of rho in exp(-s / rho)
 
 
 def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -97,7 +97,7 @@ def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first
     )
 
 
-FAR_BEYOND = 3.0  # standard errors: an estimate this far beyond its bound is significant
+FAR_BEYOND = 3.0  # numerics: in standard errors; an estimate this far beyond its bound is significant
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 

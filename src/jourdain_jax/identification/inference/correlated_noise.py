@@ -29,7 +29,7 @@ from jourdain_jax.calculus.reals import Entries
 from jourdain_jax.identification.data.experiment import Experiment
 from jourdain_jax.identification.solve.arrow import Arrow, PerMember, eliminated
 
-SHORTEST = 0.1  # shortest tau, in shortest intervals: below it the noise is white
+SHORTEST = 0.1  # numerics: shortest tau, in shortest intervals: below it the noise is white
 
 
 def chain(

@@ -37,7 +37,8 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference
 
 Matrix = Float[Array, "unknowns unknowns"]
-_CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: smaller ones count as zero
+# numerics: of the largest singular value of the scaled sensitivities: smaller ones count as zero
+_CUTOFF = 1e-6
 
 
 class PlannedInformation(Printed, eqx.Module):

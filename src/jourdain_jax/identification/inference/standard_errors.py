@@ -145,7 +145,7 @@ def _told_by_kind(
     )
 
 
-RISE_95 = 3.841458820694124  # of 2 F: 95 % quantile of chi-square
+RISE_95 = 3.841458820694124  # numerics: of 2 F: 95 % quantile of chi-square
 
 
 @dataclass(frozen=True)

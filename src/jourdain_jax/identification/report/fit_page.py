@@ -19,7 +19,7 @@ from jourdain_jax.identification.report.estimates import Estimates
 from jourdain_jax.identification.report.resumed_fit import Informed, Prediction, Profile
 from jourdain_jax.scene.printing import table
 
-_WIDTH, _HEIGHT = 460, 200  # pixels
+_WIDTH, _HEIGHT = 460, 200  # tuning: pixels
 
 
 def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:

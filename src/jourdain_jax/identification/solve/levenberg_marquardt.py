@@ -41,7 +41,7 @@ from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.identification.solve.arrow import Arrow, ByMember, ByUnknown, Flags, Members, PerMember
 from jourdain_jax.identification.solve.unknowns import Unknowns
 
-LEAST = 1e-9  # damping lambda
+LEAST = 1e-9  # numerics: damping lambda
 
 
 @dataclass

@@ -188,7 +188,7 @@ def numbers(times: int, y: Float[Array, "y *lanes"]) -> Int[Array, "times *ones"
     return jnp.reshape(jnp.arange(times), (-1, *[1] * y.ndim))
 
 
-SLOTS = (
+SLOTS = (  # code
     # maximum number of trial steps per window and of checkpoints; at least 1/16 of it if memory is limited
     256
 )

@@ -127,7 +127,7 @@ class Found(NamedTuple):
 
 
 Loop = Callable[[Start], Found]
-MOST_KERNELS = 64  # number of cached kernels; their machine code lives as long as the process
+MOST_KERNELS = 64  # tuning: number of cached kernels; their machine code lives as long as the process
 
 
 @lru_cache(maxsize=MOST_KERNELS)

@@ -69,8 +69,8 @@ def _each(part, shape: Shape) -> list:
 
 # Limit on the number of operations. Measured compile times: 15,000 operations of a chain of 128 trailers take
 # 2.8 s (XLA: 40 s), 18,000 operations of a chain of 23 joint angles take 1.2 s.
-LARGEST_PROGRAM = 60_000
-MOST_PRODUCTS = 12_000  # limit on products of coefficients in a Taylor step, whose code has no loops
+LARGEST_PROGRAM = 60_000  # tuning
+MOST_PRODUCTS = 12_000  # tuning: limit on products of coefficients in a Taylor step, whose code has no loops
 
 
 def reason_against(

@@ -152,7 +152,7 @@ def write_triangular(w: MachineWriter, n: int) -> None:
             w.store(w.load(x, k) - value * w.load(row, k), x, k)
 
 
-LARGEST_PROGRAM = 60_000  # operations
+LARGEST_PROGRAM = 60_000  # tuning: operations
 
 Kind = Literal["positions", "speeds", "determined speeds"]
 

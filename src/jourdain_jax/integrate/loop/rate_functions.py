@@ -216,7 +216,7 @@ def write_events(w: MachineWriter, form: Form) -> None:
 
 
 # limits on operations of first and second derivatives: reverse mode keeps some values on the stack
-LARGEST_DERIVATIVE = 10_000, 40_000
+LARGEST_DERIVATIVE = 10_000, 40_000  # tuning
 
 
 class Pulled(NamedTuple):

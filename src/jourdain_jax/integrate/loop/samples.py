@@ -18,7 +18,7 @@ from jourdain_jax.kernels.ir_value import Value
 
 # words of a job: pointers to tables and knots, numbers of tables and rows of knots, samples per table, knots
 # per row
-WORDS_OF_SAMPLES = 6
+WORDS_OF_SAMPLES = 6  # code
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
 
 

@@ -45,10 +45,10 @@ from jourdain_jax.integrate.loop.taylor import TaylorSteps, at_time, jet, monito
 from jourdain_jax.integrate.relation_sides import first_sides
 
 # a relative displacement of eps^NOISE counts as noise; near a loss of rank, at most eps^(1 - NOISE)
-NOISE = 0.6
+NOISE = 0.6  # numerics
 
 
-IDLE = -9.0  # code of a lane that has no sample, or whose sample has saved all its times
+IDLE = -9.0  # code: a lane that has no sample, or whose sample has saved all its times
 
 
 class Trial(NamedTuple):

@@ -17,7 +17,7 @@ from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.structure.trace import Variables
 
 # limit for all functions of time; each number is a row of a lane, so long tables should use `jj.Sampled`
-MOST_NUMBERS = 200
+MOST_NUMBERS = 200  # tuning
 
 
 def driven(program: Lowered, inputs: Inputs) -> Lowered | str:

@@ -30,7 +30,7 @@ from jourdain_jax.kernels.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList
 
-RESTS = 1e-3  # fraction of the absolute tolerance: far below errors of steps, and above round-off
+RESTS = 1e-3  # numerics: fraction of the absolute tolerance: far below errors of steps, and above round-off
 
 
 class Reset(NamedTuple):

@@ -91,7 +91,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
     return _diagnosed(trajectory, map_with_accelerations(Checks, trajectory), _lacks_work(trajectory))
 
 
-DRIFTED = 1e-2  # of the varying energy
+DRIFTED = 1e-2  # numerics: of the varying energy
 
 
 @eager_if_concrete
