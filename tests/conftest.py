@@ -241,6 +241,9 @@ def pytest_configure(config):
         install_import_hook(
             [f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype"
         )  # before any import of the package
+    import jourdain_jax as jj
+
+    jj.configure()  # some files of tests compute with JAX before they use the package
 
 
 def pytest_sessionfinish(session, exitstatus):
