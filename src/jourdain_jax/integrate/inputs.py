@@ -216,8 +216,8 @@ class Mode(eqx.Module):
         if self.ts is None or self.values is None:
             return self.value
         known = stopped((self.ts, t * self.direction))
-        passed = jnp.searchsorted(*known, side="right", method="compare_all")
-        return jnp.concatenate([jnp.asarray(self.value)[None], self.values])[passed]
+        passed = jnp.searchsorted(*known, side="right")
+        return jnp.where(passed > 0, self.values[passed - 1], self.value)
 
 
 class Inputs(eqx.Module):

@@ -312,7 +312,7 @@ def taken_in(w: Writer, count: int, numbers: OfLane, rows: Value, lane: Value) -
         w.store(w.load(numbers.place(row), type="double"), rows, row * w.lanes + lane)
 
 
-def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: OfLane) -> None:
+def handed_out(w: Writer, count: int | Value, rows: Value, lane: Value, numbers: OfLane) -> None:
     """Copy the first `count` rows of a lane into its numbers."""
     with w.counted(count) as row:
         w.store(w.load(rows, row * w.lanes + lane, "double"), numbers.place(row))

@@ -68,7 +68,7 @@ class Options:
     events: bool = True
     work: bool = True
     retry: bool = False
-    max_transitions: int = 100
+    max_transitions: int = 1000
 
 
 @dataclass(frozen=True)

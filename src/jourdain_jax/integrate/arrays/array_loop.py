@@ -78,13 +78,8 @@ class Loop(NamedTuple):
     @property
     def log(self) -> list[range]:
         """Return the rows that record transitions, one range per recorded quantity."""
-        names = [name for name in ("log_event", "log_mode", "log_lost", "log_t") if name in self.form.rows]
-        most = max(self.form.transitions, 1)
-        return [
-            range(k, k + most)
-            for name in names
-            for k in range(self.form.rows[name].start, self.form.rows[name].stop, most)
-        ]
+        rows, most = self.form.log, max(self.form.transitions, 1)
+        return [range(k, k + most) for k in rows[::most]]
 
     def writer(self, start: Start, asked: Sequence[int] = ()) -> ArrayWriter:
         """Return a writer with the functions that a step calls."""
@@ -174,7 +169,7 @@ class Loop(NamedTuple):
         code, w = self._row("code"), self.writer(start)
         rows = going.rows | {code: jnp.where(going.rows[code] == IDLE, RUNNING * 1.0, going.rows[code])}
         state = self.rows_in(w, going._replace(rows=rows), fixed)
-        end = w.load(state, Rows(0, self.form.returned))
+        end = jnp.concatenate([w.load(state, Rows(0, self.form.returned)), *going.log])
         return Found.of(self.form, ys, end, going.passed.astype(end.dtype)[None])
 
 

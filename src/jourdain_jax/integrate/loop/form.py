@@ -199,18 +199,16 @@ class Form:
         }
         most, modes = self.transitions, len(self.switched)
         log = {
-            "passed": 1,
             "log_event": most,
             "log_mode": most * self.modes,
             "log_lost": most,
             "log_t": most * (1 + len(self.moving)),
         }
-        log = log if self.goes_on else {}
         counts = {
             "y": self.integrated,
             **dict.fromkeys(PROGRESS, 1),
             "dt": len(self.moving),
-            **log,
+            **({"passed": 1} if self.goes_on else {}),
             **dict.fromkeys(CONTROL, 1),
             "mode": modes,
         }
@@ -225,13 +223,20 @@ class Form:
         }
         counts |= dict.fromkeys(("rest", "next_rest"), self.y) if self.compensated else {}
         counts |= (
-            {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if self.goes_on else {}
+            {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes, **log}
+            if self.goes_on
+            else {}
         )
         return _in_a_row(counts)
 
     @property
+    def log(self) -> range:
+        """Return the rows that record transitions, which are the last rows."""
+        return range(self.rows["log_event"].start if self.goes_on else self.all, self.all)
+
+    @property
     def returned(self) -> int:
-        """Return the number of rows returned by a motion."""
+        """Return the number of rows returned by a motion, before those of `log`."""
         return self.rows[CONTROL[0]].start
 
     @property

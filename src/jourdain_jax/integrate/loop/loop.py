@@ -305,7 +305,13 @@ def _save(
     with w.when(last < times):
         set_goal(w, lanes, lane, goal_of(w, job, goals, number, last))
     with w.when(last >= times):
-        end = of_lane(w, ends, count, form.returned + 1, number)
+        end = of_lane(w, ends, count, form.returned + len(form.log) + 1, number)
         handed_out(w, form.returned, lanes.pointer, lane, end)
-        w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end.place(form.returned))
+        if most := form.transitions:
+            noted = w.converted("fptosi", w.smaller(lanes.of("passed", lane), float(most)), "i64")
+            for k in range(0, len(form.log), most):
+                log = w.at(lanes.pointer, form.log.start + k)
+                handed_out(w, noted, log, lane, end.after(form.returned + k))
+        reached = w.converted("sitofp", w.where(runs, times, saved), "double")
+        w.store(reached, end.place(form.returned + len(form.log)))
         w.run("begin", job, lanes.pointer, who, lane)

@@ -78,7 +78,7 @@ class Found(NamedTuple):
     t: Numbers  # time of the end, measured from the start
     log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
     # rows of the progress except its time; the number of goals reached; then the number, the events, the
-    # energy losses and the modes of transitions
+    # modes and the energy losses of transitions; unused entries of a log may hold any number
     rest: Float[Array, "rest *lanes"]
 
     @staticmethod
@@ -92,14 +92,12 @@ class Found(NamedTuple):
         rows, parts = form.rows, range(1 + len(form.moving))
         every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
 
-        def named(name: str) -> Array:
-            return end[rows[name].start : rows[name].stop]
-
         log: list[Array] = [jnp.zeros((0, *end.shape[1:]), end.dtype) for _ in parts]
         more = []
         if form.transitions:
-            log = jnp.split(named("log_t"), len(parts))
-            more = [named(name) for name in ("passed", "log_event", "log_lost", "log_mode") if rows[name]]
+            times = rows["log_t"].start - form.all
+            log = jnp.split(end[times:], len(parts))
+            more = [end[rows["passed"].start][None], end[form.returned : times]]
         progress = end[rows[PROGRESS[1]].start : rows[PROGRESS[-1]].stop]
         return Found(
             tuple(states[:, part] for part in every),
@@ -136,7 +134,7 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Loop:
     steps = method if order is None else TaylorSteps(order)
 
     def shapes(*arguments):
-        return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
+        return (arguments[-1].shape[-1], form.integrated), (form.returned + len(form.log) + 1,)
 
     run = called(
         lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form), constant=constant_rows(form)

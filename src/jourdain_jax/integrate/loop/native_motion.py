@@ -305,9 +305,9 @@ def solved(form: Form, goals: PerTime, found: Found) -> Solved:
     most = form.transitions
     passed = NONE_PASSED
     if most:
-        number, more = found.rest[8], found.rest[9:]
-        times = jnp.where(jnp.arange(most) < number, log, jnp.inf)
-        modes = jnp.reshape(more[2 * most :], (form.modes, most)) if form.modes else jnp.zeros((0, most))
-        passed = Passed(times, more[:most].astype(jnp.int32), more[most : 2 * most], modes)
+        there = jnp.arange(most) < found.rest[8]
+        more = jnp.where(there, jnp.reshape(found.rest[9:], (2 + form.modes, most)), 0.0)
+        times = jnp.where(there, log, jnp.inf)
+        passed = Passed(times, more[0].astype(jnp.int32), more[-1], more[1:-1])
     y_end, of_steps = Integrated.of(end, form), (accepted, rejected, h, pivot, crossings)
     return Solved(goals[:-1], ys, reached[:-1], t, y_end, code, event, *of_steps, passed)
