@@ -447,7 +447,7 @@ def test_a_family_in_arrays_and_in_text(turns):
 
 def test_a_family_is_drawn_against_its_own_values(turns, straight):
     _, (axis,) = jj.plot(turns, "x_rate", "lean", units={"lean": "deg"})
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("x_rate", "lean in deg")
+    assert (axis.get_xlabel(), axis.get_ylabel()) == (r"$\dot{x}$ in m/s", "lean in deg")
     assert max(axis.lines[0].get_ydata()) == pytest.approx(np.rad2deg(0.4200892), abs=0.2)
     assert {text.get_text() for text in axis.get_legend().get_texts()} == {
         "unstable",

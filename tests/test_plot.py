@@ -1,5 +1,6 @@
 """Figures of quantities against time show the values of the motion, in the requested unit."""
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -51,8 +52,9 @@ def test_values_are_drawn_in_the_units_that_are_asked_for(motions, name, unit, s
     expected = energies.kinetic + energies.potential if name == "energy" else motions[0][name]
     (line,) = axes[0].lines
     assert_allclose(line.get_xydata(), np.stack([1000 * TS, size * expected], axis=1), rtol=1e-12, atol=1e-12)
-    assert axes[0].get_ylabel() == f"{name} in {unit}"
-    assert axes[0].get_xlabel() == "t in ms"
+    symbol = {"x": "$x$", "x_rate": r"$\dot{x}$"}.get(name, name)
+    assert axes[0].get_ylabel() == f"{symbol} in {unit}"
+    assert axes[0].get_xlabel() == "$t$ in ms"
     assert figure is axes[0].figure
 
 
@@ -109,3 +111,41 @@ def test_rollouts_and_motions_share_a_figure_and_the_axes_of_a_user(lanes, motio
     written = (tmp_path / "two.svg").read_text()
     assert "motion 0" in written
     assert "motion 1" in written
+
+
+def test_labels_have_the_units_that_bodies_show_and_panels_have_letters():
+    axle = jj.simulate(jj.models.model("two-wheel-axle-coordinates"), t1=0.1, ts=TS[:2] / 10)
+    _, axes = jj.plot(axle, "x1", "psi1_rate", "phi", "energy")
+    labels = [axis.get_ylabel() for axis in axes]
+    assert labels == [r"$x_{1}$ in m", r"$\dot{\psi}_{1}$ in rad/s", r"$\phi$ in rad", "energy in J"]
+    assert [axis.get_title(loc="right") for axis in axes] == ["(a)", "(b)", "(c)", "(d)"]
+    wire = jj.simulate(BeadOnTurningWire(), {"r": 0.3}, t1=0.1)
+    assert jj.plot(wire, "r")[1][0].get_ylabel() == "$r$ in m"
+    assert not jj.plot(wire, "r")[1][0].get_title(loc="right")
+
+
+class Bob(jj.Scene):
+    """A bob on a rod of 1 m, and a body that one speed turns and moves by 1 m: their units stay open."""
+
+    coordinates = jj.coordinates("a", "b")
+
+    def bodies(self, t, q):
+        return {
+            "bob": jj.Particle(1.0, jj.vec(jnp.sin(q.a), 0, -jnp.cos(q.a))),
+            "wheel": jj.RigidBody(1.0, jnp.eye(3), jj.vec(q.b, 3, 0), jj.rot_y(q.b)),
+        }
+
+
+def test_units_that_bodies_do_not_show_stay_open():
+    _, axes = jj.plot(jj.simulate(Bob(), {"a": 0.1}, t1=0.1), "a", "b")
+    assert [axis.get_ylabel() for axis in axes] == ["$a$", "$b$"]
+
+
+@pytest.mark.parametrize(("style", "width"), [("column", 3.4), ("two_columns", 7.0)])
+def test_a_style_sets_width_and_fonts(motions, style, width):
+    with plt.style.context(f"jourdain_jax.views.{style}"):
+        figure, axes = jj.plot(motions, "heading", "x_rate")
+        figure.draw_without_rendering()
+    assert figure.get_size_inches()[0] == width
+    assert axes[0].yaxis.label.get_size() < 10
+    assert not overlap(figure, *(axis.yaxis.label for axis in axes))

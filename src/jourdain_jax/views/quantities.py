@@ -1,6 +1,7 @@
 """Plots of named quantities over time, quantile bands of rollouts, and families against a parameter."""
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.figures import pyplot
 from jourdain_jax.calculus.files import FilePath, check_place
 from jourdain_jax.calculus.reals import check_kind, described
+from jourdain_jax.equations.kinematics import partial_velocities
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -29,6 +31,10 @@ UNITS = {  # size in SI units, by kind of quantity
     },
     "energy": {"J": 1.0, "kJ": 1e3, "mJ": 1e-3},
 }  # fmt: skip
+
+GREEK = (
+    "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi pi rho sigma tau phi chi psi omega"
+)
 
 
 def check_format(path: FilePath) -> None:
@@ -61,13 +67,16 @@ def plot(
     - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"` or their sum `"energy"` (default:
       all coordinates of the first motion). A rollout has only coordinates and speeds. It is drawn as the
       median of the samples still running, with a band for each fraction in `bands`.
-    - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians).
+    - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: m, rad and
+      their rates, where a body moves by 1 m or turns by 1 rad per unit; otherwise none).
       Coordinates: m, km, cm, mm, rad, mrad, deg, turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s,
       rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
     - A family (`jj.family`) is drawn against one of its quantities, named first:
       `jj.plot(turns, "x_rate", "lean")`. Stable parts are solid lines; special points are marked.
     - `title`: for a rollout, by default the number of samples that stopped or failed. `path`: file to write
       (.png, .svg, .pdf); `axes`: existing axes, one per name.
+    - For one column of a journal or two: `with plt.style.context("jourdain_jax.views.column")`, or
+      `.two_columns`. The width of a figure and the height of a panel are those of matplotlib's style.
 
     Returns the matplotlib figure and an array of its axes, shape (names,). Raises KeyError for an unknown
     name, ValueError for an unknown unit, bands outside 0 to 1 or an invalid motion, and ImportError without
@@ -100,15 +109,16 @@ def _plot_motions(
     scenes = [_scene(one) for one in motions]
     names = names or scenes[0].coordinate_names.entries
     values = [[_values(one, name, bands) for name in names] for one in motions]
-    sizes = _checked_units(units, scenes)
+    one = motions[0].lane(0) if isinstance(motions[0], Rollout) else motions[0]
+    sizes = _usual_units(one.scene, np.asarray(one.q)[0]) | _checked_units(units, scenes)
     own = axes is None
-    axes = _panels(axes, names, 1.4)
+    axes = _panels(axes, names, 0.3)
     for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        unit, size = sizes.get(name, ("J" if name in ENERGIES else "", 1.0))
+        unit, size = sizes[name]
         for j, (one, label) in enumerate(zip(motions, labels, strict=True)):
             _draw(axis, one, values[j][k] / size, sizes["t"][1], bands, f"C{j}", label)
-        axis.set_ylabel(f"{name} in {unit}" if unit else name)
-    axes[-1].set_xlabel(f"t in {sizes['t'][0]}")
+        axis.set_ylabel(_label(name, unit))
+    axes[-1].set_xlabel(_label("t", sizes["t"][0]))
     if title is None and len(motions) == 1 and isinstance(motions[0], Rollout):
         stopped = int(np.sum(motions[0].result == result_codes.EVENT))
         title = f"{len(motions[0])} samples; {stopped} stopped at an event, {motions[0].failed.size} failed"
@@ -135,9 +145,10 @@ def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
             f"vertical axis, got {len(names)} names"
         )
     scene = family.equations.scene
-    sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
-    label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
-    axes = _panels(axes, names[1:], 2.4)
+    sizes = _usual_units(scene, np.asarray([family[name][0] for name in scene.coordinate_names.entries]))
+    sizes = dict.fromkeys(names, ("", 1.0)) | sizes | _checked_units(units, [scene])
+    label = {name: _label(name, unit) for name, (unit, _) in sizes.items()}
+    axes = _panels(axes, names[1:], 0.5)
     marks = {
         "fold": ("d", family.folds),
         "branch point": ("s", family.branches),
@@ -162,12 +173,17 @@ def _plot_family(family: Family, names: Labels, units, title: str | None, axes):
 
 
 def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
-    """Return axes for each name: the user's, or one panel per name in a column."""
+    """Return axes for each name: the user's, or one panel per name in a column, with letters. `height`: of a
+    panel, relative to a figure of matplotlib's style.
+    """
     if axes is None:
-        size = 7.0, 1.2 + height * len(names)
-        axes = pyplot().subplots(
-            len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained"
-        )[1][:, 0]
+        plt = pyplot()
+        wide, high = plt.rcParams["figure.figsize"]
+        size = wide, high * (0.25 + height * len(names))
+        axes = plt.subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1]
+        axes = axes[:, 0]
+        for k, axis in enumerate(axes if len(names) > 1 else ()):
+            axis.set_title(f"({chr(ord('a') + k)})", loc="right", fontsize="small")
     axes = np.atleast_1d(axes)
     if len(axes) != len(names):
         raise ValueError(
@@ -176,6 +192,37 @@ def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
     for axis in axes:
         axis.grid(alpha=0.3)
     return axes
+
+
+def _label(name: str, unit: str) -> str:
+    """Return the label of an axis; single and Greek letters are set as symbols, with a dot for `_rate`."""
+    parts = re.fullmatch(rf"({GREEK.replace(' ', '|')}|[a-zA-Z])_?(\d*)(_rate)?", name)
+    if parts:
+        letter, number, rate = parts.groups()
+        letter = "\\" * (len(letter) > 1) + letter
+        letter = rf"\dot{{{letter}}}" if rate else letter
+        name = f"${letter}_{{{number}}}$" if number else f"${letter}$"
+    return f"{name} in {unit}" if unit else name
+
+
+def _usual_units(scene, q: np.ndarray) -> dict[str, tuple[str, float]]:
+    """Return name -> (unit, 1.0) of energies, and of coordinates and speeds as far as the motion of bodies
+    shows them.
+
+    A speed is in m/s if it moves a body by 1 m/s in a fixed direction, and in rad/s if it turns one by
+    1 rad/s; if it does both, or neither, its unit stays open. A coordinate is known by its own rate.
+    """
+    names, units = scene.speed_names.entries, dict.fromkeys(ENERGIES, "J")
+    near, far = (partial_velocities(scene, 0.0, x, np.zeros(len(names))) for x in (q, q + 0.1))
+    for k, name in enumerate(names):
+        moves = np.isclose(np.linalg.norm(near.linear[:, :, k], axis=1), 1.0)
+        fixed = np.isclose(near.linear[:, :, k], far.linear[:, :, k]).all(axis=1)
+        turns = np.isclose(np.linalg.norm(near.angular[:, :, k], axis=1), 1.0).any()
+        if (moves & fixed).any() != turns:
+            unit = "rad" if turns else "m"
+            units |= {name.removesuffix("_rate"): unit, name: f"{unit}/s"}
+    valid = (*ENERGIES, *scene.coordinate_names.entries, *names)
+    return {name: (units.get(name, ""), 1.0) for name in valid}
 
 
 def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
