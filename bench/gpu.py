@@ -83,20 +83,30 @@ BICYCLES = {
 KINDS = {"disc": DISCS, "bicycle": BICYCLES}
 SPREAD = {"disc": (-6.0, -3.0), "bicycle": (0.1, 0.5)}
 FOUR = ("chaplygin-sleigh", "double-pendulum-rods", "rattleback", "snakeboard")
-FORMS = ("values", "tangent", "gradient")
-OTHERS = sorted(set(jj.models.MODELS) - {"tilting-disc", "whipple-bicycle"})
+FORMS, SECOND = ("values", "tangent", "gradient"), "second derivatives"
+NAMES = {"disc": "tilting-disc", "bicycle": "whipple-bicycle"}
+ASSEMBLED = {
+    "registers": r"Used (\d+) r",
+    "bytes of stack": r"(\d+) bytes stack",
+    "bytes spilled": r"(\d+) bytes spill st",
+}
+OTHERS = sorted(set(jj.models.MODELS) - set(NAMES.values()))
 
 
 def functions_of(of: str) -> dict[str, Callable]:
-    """Return values, a tangent and a gradient of a model's motion, as functions of the varied number."""
-    if of in KINDS:
-        return {name: function for name, (_, function) in KINDS[of].items()}
+    """Return values, a tangent, a gradient and second derivatives of a model's motion, as functions of the
+    varied number.
+    """
     from ends_of_models import end_of_model
 
-    numbers = [p for p, value, _ in parameters_of(jj.models.MODELS[of]()) if np.ndim(value) == 0]
-    end, x = end_of_model(of, None, numbers[:1], ts=[0.1, 0.2])
+    numbers = [
+        p for p, value, _ in parameters_of(jj.models.MODELS[NAMES.get(of, of)]()) if np.ndim(value) == 0
+    ]
+    end, x = end_of_model(NAMES.get(of, of), None, numbers[:1], ts=[0.1, 0.2])
     along = lambda s: end(x + s)
-    return dict(zip(FORMS, (along, jax.jacfwd(along), lambda s: jax.grad(end)(x + s)), strict=True))
+    forms = along, jax.jacfwd(along), lambda s: jax.grad(end)(x + s), lambda s: jax.hessian(end)(x + s)
+    found = dict(zip((*FORMS, SECOND), forms, strict=True))
+    return found | {name: function for name, (_, function) in KINDS.get(of, {}).items()}
 
 
 def spread(of: str, lanes: int) -> jax.Array:
@@ -260,15 +270,21 @@ def twin(of: str, name: str, quick: bool) -> Figures:
         every = [nvidia.text_for(text, architecture) for text in texts]
         missing = sum(len(re.findall(r"^\.extern", ptx, re.M)) for ptx in every)
         yield figure(f"undefined functions for {architecture}, {name}", of, missing, 0)
-        if architecture == "sm_90" and (said := "".join(map(gpu_twin.said_by_assembler, every))):
-            for what, pattern in {
-                "registers": r"Used (\d+) r",
-                "bytes of stack": r"(\d+) bytes stack",
-                "bytes spilled": r"(\d+) bytes spill st",
-            }.items():
-                yield figure(
-                    f"{what} for sm_90, {name}", of, max(map(int, re.findall(pattern, said)), default=0)
-                )
+
+
+def resources(of: str, name: str, quick: bool) -> Figures:
+    """Registers, stack and spills of the kernels of a model, by `ptxas` for compute capability 9.0; kernels
+    of an earlier part in the same process are left out.
+    """
+    import gpu_twin
+
+    before = len(gpu_twin.DRIVER.loaded)
+    with gpu_twin.in_place_of_a_gpu():
+        jax.jit(jax.vmap(functions_of(of)[name])).lower(spread(of, 7))
+    texts = gpu_twin.DRIVER.loaded[before:]
+    said = "".join(gpu_twin.said_by_assembler(nvidia.text_for(text, "sm_90")) for text in texts)
+    found = [max(map(int, re.findall(pattern, said)), default=0) for pattern in ASSEMBLED.values()]
+    yield figure(f"{', '.join(ASSEMBLED)} for sm_90, {name}", of, ", ".join(map(str, found)))
 
 
 def device(quick: bool) -> Figures:
@@ -281,11 +297,19 @@ def without_gpu() -> tuple[dict, list[str]]:
     if reason := host.reason_against() or nvidia.reason_against_text():
         print(f"no text for GPUs is made: {reason}")
         return {}, []
+    import gpu_twin
+
     parts = {
         f"on the CPU, {of}, {name}": partial(twin, of, name)
         for of in (*KINDS, *FOUR, *OTHERS)
         for name in KINDS.get(of, FORMS)
     }
+    if gpu_twin.assembler():
+        parts |= {
+            f"assembler, {of}, {name}": partial(resources, of, name)
+            for of in (*KINDS, *FOUR, *OTHERS)
+            for name in (*KINDS.get(of, FORMS), SECOND)
+        }
     parts["on the CPU, study"] = partial(study, 20_000, None)  # the calls alone: the figure is one of the CPU
     quick = [f"on the CPU, disc, {name}" for name in ("values", "gradient")] + ["on the CPU, study"]
     return parts, [*quick, *(f"on the CPU, {of}, values" for of in (*FOUR, "bicycle"))]

@@ -281,17 +281,18 @@ def driver_of_devices(
     return SimpleNamespace(**dict.fromkeys(set(nvidia._CALLED) - {missing}) | own)
 
 
+def assembler() -> str | None:
+    """NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit."""
+    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")]
+    return found[0] if found else shutil.which("ptxas")
+
+
 def said_by_assembler(ptx: str) -> str:
-    """What NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit, says of text for compute
-    capability 9.0; empty where there is none.
-    """
-    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")] + [
-        shutil.which("ptxas")
-    ]
-    if not found[0]:
+    """What it says of text for compute capability 9.0; empty where there is none."""
+    if not (found := assembler()):
         return ""
     done = subprocess.run(
-        [found[0], "-arch=sm_90", "-v", "-o", "/dev/null", "-"], input=ptx, capture_output=True, text=True
+        [found, "-arch=sm_90", "-v", "-o", "/dev/null", "-"], input=ptx, capture_output=True, text=True
     )
     assert not done.returncode, done.stderr
     return done.stderr

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
+from small_scenes import OnPlane
 from test_modes import NUMBERS, seen
 
 import jourdain_jax as jj
@@ -133,12 +134,43 @@ def test_lanes_come_last_and_what_they_share_is_given_once():
         "[dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>, dense<0> : tensor<1xindex>]",
         "[dense<[0, 2, 1]> : tensor<3xindex>, dense<[0, 1]> : tensor<2xindex>, dense<0> : tensor<1xindex>]",
     )
+    # projection of the start, its derivative, and energies of three states: only a speed or a state differs
+    small = {call[2] for call in calls if call not in (forth, back)}
+    assert {(7, 3, 11), (7, 3, 7), (7, 3, 6, 5)} <= {
+        tuple(map(int, re.findall(r"\d+(?=x)", x))) for x in small
+    }
     # the same, cotangents of states and ends, times, and the largest number of trial steps
     assert re.fullmatch(
         r"tensor<7x\d+xf64>, tensor<\d\d+xf64>, tensor<7x2x\d+xf64>, tensor<7x\d+xf64>, tensor<2xf64>,"
-        r" tensor<f64>",
+        r" tensor<1xf64>",
         back[2],
     )
+
+
+class Pushed(OnPlane):
+    """x'' = push."""
+
+    inputs = jj.inputs("push")
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+
+def test_samples_that_lanes_share_are_given_once():
+    times, run = (
+        [0.0, 0.5, 2.0],
+        lambda x, values: (
+            jj.simulate(Pushed(), {"x": x}, ts=[0.1], inputs={"push": jj.Sampled(times, values)}).q_end
+        ),
+    )
+    xs, values = np.linspace(0.4, 0.6, 7), np.array([0.0, 1.0, 0.3])
+    for varied, tables in ((xs, "1x2x3"), (jnp.outer(xs, values), "7x1x2x3")):
+        of = (lambda x: run(x, values)) if varied is xs else (lambda values: run(0.3, values))
+        expected = jax.jit(jax.vmap(of))(varied)
+        with gpu_twin.in_place_of_a_gpu():
+            program = jax.jit(jax.vmap(of))
+            assert f"(tensor<{tables}xf64>, " in program.lower(varied).as_text()
+            np.testing.assert_array_equal(program(varied), expected)
 
 
 def test_no_lanes_are_no_call_that_fails():
@@ -283,6 +315,9 @@ one, speeds = jax.vmap(jax.value_and_grad(end)), np.linspace(0.4, 0.6, 6)
 expected = jax.jit(one)(speeds)
 mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
 with gpu_twin.in_place_of_a_gpu() as launched:
+    mass = jax.device_put(1.3, jax.devices()[1])
+    chunks = jj.rollout(scene.replace(mass=mass), {"x_rate": speeds}, ts=[0.1], chunk=4).lanes
+    assert chunks.q.devices() == {jax.devices()[1]}
     shared = jax.jit(jax.shard_map(one, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))
     found = jax.block_until_ready(shared(speeds))
     second = jax.block_until_ready(jax.jit(one)(jax.device_put(speeds, jax.devices()[1])))

@@ -14,7 +14,8 @@ import hashlib
 import re
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -240,8 +241,9 @@ def register(name: str, text: str, platform: str, effort: int = 2) -> None:
             _REGISTERED.add(name)
 
 
-# words of a job: index of the next row, number of rows, pointers to the given and to the returned rows
-NEXT, COUNT, IN, OUT = range(4)
+# words of a job: index of the next row, number of rows, pointers to the given rows, to the returned rows, and
+# to the given numbers that all lanes of a GPU share
+NEXT, COUNT, IN, OUT, SHARED = range(5)
 
 
 def start_counting(w: Writer, job: Value, word: int) -> None:
@@ -256,7 +258,8 @@ def next_lane(w: Writer, job: Value, word: int) -> Value:
 
 def lanes_taken(w: Writer, job: Value, word: int) -> Value:
     """Return how many lanes have been taken, which may exceed their number."""
-    return w.load(w.load(job, word, "ptr"), type="i64") if w.device else w.load(job, word, "i64")
+    counter = w.load(job, word, "ptr") if w.device else w.at(job, word, "i64")
+    return w.instruction("i64", f"load atomic i64, ptr {counter.name} monotonic, align 8")  # others count
 
 
 def share(w: Writer, job: Value, count: Value) -> None:
@@ -318,6 +321,22 @@ def handed_out(w: Writer, count: int | Value, rows: Value, lane: Value, numbers:
         w.store(w.load(rows, row * w.lanes + lane, "double"), numbers.place(row))
 
 
+def sources(
+    w: Writer, rows: int, own: OfLane, shared: Value, first: int = 0
+) -> Iterator[tuple[range, bool, OfLane]]:
+    """Yield the rows of a lane's start as contiguous ranges, split at row `first`. For each range, also yield
+    whether all lanes share it, and its source in memory. On a GPU, `shared` rows form an array of their own.
+    """
+    places = {False: 0, True: 0}
+    for (is_shared, _), run in groupby(
+        range(rows), lambda row: (bool(w.device and w.common[row]), row < first)
+    ):
+        some = [*run]
+        source = (OfLane(shared, 1) if is_shared else own).after(places[is_shared])
+        yield range(some[0], some[-1] + 1), is_shared, source
+        places[is_shared] += len(some)
+
+
 def write_rows(w: Writer, given: int, returned: int) -> None:
     """Write a handler that maps rows of `given` numbers to rows of `returned` numbers. The handler calls the
     module's `row(given, returned)` for several lanes at once.
@@ -327,13 +346,15 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")
         rows, results, count = w.load(job, IN, "ptr"), w.load(job, OUT, "ptr"), w.load(job, COUNT, "i64")
+        shared = w.load(job, SHARED, "ptr") if w.device else w.null
         with w.repeated() as leave:
             leave(~w.together(lanes_taken(w, job, NEXT) < count))
             with w.each_lane() as lane:
                 number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
                 known = w.where(number < count, number, count - 1)
-                taken_in(w, given, of_lane(w, rows, count, given, known), state, lane)
+                for some, _, numbers in sources(w, given, of_lane(w, rows, count, given, known), shared):
+                    taken_in(w, len(some), numbers, w.at(state, some.start), lane)
             w.run("row", state, found)
             with w.each_lane() as lane:
                 number = w.load(who, lane, "i64")
@@ -342,12 +363,13 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
         w.give(w.null)
 
     def body(arguments: list[Given], results: list[Given]) -> None:
-        job, count = w.room(4, "i64"), w.room(type="i64")
+        job, count = w.room(5, "i64"), w.room(type="i64")
         w.store(product(w, results[0], 1), count)
         start_counting(w, job, NEXT)
         w.store(w.load(count, type="i64"), job, COUNT)
         w.store(arguments[0].data, job, IN)
+        w.store(arguments[-1].data, job, SHARED)
         w.store(results[0].data, job, OUT)
         share(w, job, w.load(count, type="i64"))
 
-    write_handler(w, 1, 1, body)
+    write_handler(w, 1 + w.device, 1, body)

@@ -9,7 +9,7 @@ On a GPU (`device`) every thread runs the same code with its own lane; the threa
 """
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
@@ -22,10 +22,12 @@ class Writer:
 
     `fused`: whether `fma` rounds once; `threads`: number of threads that share the lanes on a CPU; `device`:
     whether the module is for a GPU. `record`: for a GPU, the number of doubles per slot of the record of
-    steps (0: no record) and the maximum number of bytes of all slots.
+    steps (0: no record) and the maximum number of bytes of all slots; `common`: for each row of a start,
+    whether all lanes of a GPU share it.
     """
 
     eps = 2.0**-52
+    common: Sequence[bool] = ()
 
     def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
         self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device

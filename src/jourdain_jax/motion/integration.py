@@ -39,6 +39,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases
 from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.modes import Modes
+from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import faults_at
 from jourdain_jax.structure.row_program import row_program
 
@@ -65,7 +66,7 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     times, fixed, _ = lanes_first((plain.times, plain.args[3], asked))
     times = with_derivatives_of(lambda _, times, timely: times.fitting(timely), times, setup.times, timely)
     fixed = with_derivatives_of(lambda _, field, *of: field.fixed(*of), fixed, setup.field, setup.scene)
-    return given, setup.at(times), asked, _begin(setup, timely, fixed, plain)
+    return given, setup.at(times), asked, _begin(setup, timely, given.scene, fixed, plain)
 
 
 # These options minimise XLA's compile time and do not affect steps in machine code. Processor time of a first
@@ -146,12 +147,17 @@ def _in_contact(setup: Setup) -> Setup:
 
 
 def _begin(
-    setup: Setup, timely: Flag | np.bool_, fixed: tuple | None = None, plain: Plain | None = None
+    setup: Setup,
+    timely: Flag | np.bool_,
+    shared: Scene | None = None,
+    fixed: tuple | None = None,
+    plain: Plain | None = None,
 ) -> Begun:
+    """Return the start of the integration. `shared`: the scene before `_entered` marks its numbers."""
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
-    right, start = _without_faults(setup, start)
+    right, start = _without_faults(setup._replace(scene=scene if shared is None else shared), start)
     args = field, scene, setup.inputs, field.fixed(scene) if fixed is None else fixed, setup.t0
     return Begun(right, timely, start, args, field.pack(start.q, start.u), plain)
 
@@ -163,7 +169,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     direction = jnp.sign(setup.t1 - t0)
     transitions = solved.passed.times(origin, setup.ts, solved.ts, direction)
     inputs = in_phases(inputs, transitions, solved.passed.modes, direction)
-    args = field, scene, inputs, fixed, origin
+    args, plain = (field, scene, inputs, fixed, origin), begun.plain.args if begun.plain else begun.args
     stores = field.with_work and field.of_inputs
     stored_first = field.stored(scene, t0, start.q, inputs(t0)) if stores else None
     puts_back = field.projects and not integrator.own
@@ -180,7 +186,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         y = begun.y0.with_rows(rows)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
         _, at = integrands.at_time(tau, y, args)
-        u, pivot = field.speeds_and_pivot(at)
+        u, pivot = field.speeds_and_pivot(at, plain[3])
         work = y.work
         if stored_first is not None:
             work = work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
@@ -200,7 +206,6 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted)
         causes.append((drifted, result_codes.OFF_CONSTRAINTS))
     if conserves(setup):
-        plain = begun.plain.args if begun.plain else args
         near = energies_near(setup, plain, states, begun.y0.with_rows)
         causes.append((energy_lost(*near, solved.accepted), result_codes.ENERGY_LOST))
     if field.rows_may_contradict:

@@ -90,20 +90,22 @@ def _next_retries(
     for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
         again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
-        # copy the samples to the host only if one may be retried
-        known = jax.tree.map(np.asarray, lanes) if again.size else lanes
-        for i in again:
-            found[i] = _next_retry(field, at_index(known, i), begun[i], options)
+        # copy to the host only samples that may be retried
+        known = jax.tree.map(np.asarray, at_index(lanes, again)) if again.size else lanes
+        for k, i in enumerate(again):
+            found[i] = _next_retry(field, at_index(known, k), begun[i], options)
     return found
 
 
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """Replace the samples at `index` by the samples of `again`."""
+    """Replace the samples at `index` by the samples of `again`, on their device."""
     leaves, treedef = jax.tree.flatten(lanes)
-    new = [np.array(x) for x in leaves]
-    for old, y in zip(new, jax.tree.leaves(again), strict=True):
-        old[index] = np.asarray(y)
-    return jax.tree.unflatten(treedef, new)
+    return jax.tree.unflatten(treedef, _put(leaves, jax.tree.leaves(again), index))
+
+
+@jax.jit
+def _put(leaves: list[Array], new: list[Array], index: Array) -> list[Array]:
+    return [x.at[index].set(y) for x, y in zip(leaves, new, strict=True)]
 
 
 def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:

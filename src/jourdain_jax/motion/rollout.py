@@ -6,6 +6,7 @@ The samples of a chunk are integrated together; chunks run one after the other i
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Unpack
 
 import equinox as eqx
@@ -253,25 +254,35 @@ def rollout(
     def run_some(options: AllOptions, index: np.ndarray) -> Trajectory:
         return run(options, *at_index((varied, parameters), index))
 
-    pieces = []
+    every: list[Array] = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
-        # copies of the last sample fill the last chunk
-        index = np.minimum(np.arange(first, first + chunk), count - 1)
-        piece = run_some(options, index)
-        # a single piece stays on its device; several are joined on the host
-        pieces.append(jax.block_until_ready(piece) if chunk == count else jax.tree.map(np.asarray, piece))
+        begin = min(first, count - chunk)  # the last chunk overlaps the one before
+        piece = jax.block_until_ready(run_some(options, np.arange(begin, begin + chunk)))
+        some, treedef = jax.tree.flatten(piece)
+        every = some if chunk == count else _stored(every or _room(some, count), some, begin)
         bar.update(min(chunk, count - first))
     bar.close()
-    lanes = (
-        pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
-    )
+    lanes = jax.tree.unflatten(treedef, every)
     reruns = ()
     if options.retry:
         own_times = isinstance(varied, State) and span["t0"] is None
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
         lanes, reruns = lanes_retried(run_some, form, lanes, begun, options, chunk)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), reruns)
+    return Rollout(lanes, reruns)
+
+
+@partial(jax.jit, static_argnums=1)
+def _room(some: list[Array], count: int) -> list[Array]:
+    """Return memory for `count` samples on the device of a chunk."""
+    return [jnp.zeros((count, *x.shape[1:]), x.dtype) for x in some]
+
+
+@partial(jax.jit, donate_argnums=0)
+def _stored(every: list[Array], some: list[Array], first: Array) -> list[Array]:
+    """Return all samples with those of a chunk, from sample `first` on, stored in place on the device."""
+    put = jax.lax.dynamic_update_slice_in_dim
+    return [put(x, new, first, 0) for x, new in zip(every, some, strict=True)]
 
 
 def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:

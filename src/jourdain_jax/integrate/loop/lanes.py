@@ -24,11 +24,7 @@ class MachineWriter(Writer):
         if_any(c, body)            run the body if c holds in any lane; the body selects lanes by `where`
         over_stages(n, body, x)    x <- body(i, x) for all stages i
         each(rows, body)           run the body for each row, independently
-
-    `common`: for each row of a start, whether all lanes of a GPU share it; shared rows are stored once.
     """
-
-    common: Sequence[bool] = ()
 
     def constant(self, pointer: Value, index: int) -> Value:
         """Load a number that all threads of a GPU share, from memory that is constant during the kernel."""

@@ -8,7 +8,6 @@ reached. If inputs are sampled, their tables and knots are the first arguments (
 """
 
 import math
-from itertools import groupby
 
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
@@ -40,6 +39,7 @@ from jourdain_jax.kernels.ffi import (
     of_lane,
     product,
     share,
+    sources,
     start_counting,
     taken_in,
     write_handler,
@@ -189,19 +189,14 @@ def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple
 
     On a GPU, numbers that all samples share and no step changes are read in place, so they are omitted.
     """
-    count, places = w.load(job, COUNT, "i64"), {False: 0, True: 0}
-    found, shared = [], w.common if w.device else [False] * form.given
-    sources = {False: of_lane(w, w.load(job, STARTS, "ptr"), count, form.given, lane)}
-    if w.device:
-        sources[True] = OfLane(w.load(job, COMMON, "ptr"), 1)
-    for (is_shared, stays), run in groupby(
-        range(form.given), lambda row: (shared[row], shared[row] and row >= form.rows["known"].start)
-    ):
-        rows = [*run]
-        if not stays:
-            found.append((range(rows[0], rows[-1] + 1), sources[is_shared].after(places[is_shared])))
-        places[is_shared] += len(rows)
-    return found
+    count, known = w.load(job, COUNT, "i64"), form.rows["known"].start
+    own = of_lane(w, w.load(job, STARTS, "ptr"), count, form.given, lane)
+    common = w.load(job, COMMON, "ptr") if w.device else w.null
+    return [
+        (rows, numbers)
+        for rows, is_shared, numbers in sources(w, form.given, own, common, known)
+        if not (is_shared and rows.start >= known)
+    ]
 
 
 def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:

@@ -55,6 +55,7 @@ class Start(NamedTuple):
     known: tuple[tuple[Array, ...], ...]
     modes: Numbers = ()
     plain: tuple[Array, ...] = ()  # `known`; arrays that all samples share have no batch axis
+    tables: tuple[Array, ...] = ()  # of sampled inputs; machine code refuses their derivatives
 
     def numbers(self) -> Numbers:
         """Return the rows after the state at the start, except `constant_rows`. Rows that all lanes share
@@ -173,7 +174,7 @@ def flow(form: Form, method: Method, order: int | None) -> Loop:
         return kernel(form, method, None if too_many else order)
 
     def check(form: Form, along: Start) -> None:
-        if not all(map(is_zero, along.of_samples[:1])):
+        if not all(map(is_zero, along.tables)):
             raise DifferentiationModeError(OF_SAMPLES)
         check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
 

@@ -201,15 +201,17 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 
 def start_of(setup: Setup, begun: Begun) -> Start:
     """Return the arguments of the kernel for a motion."""
-    knots, goals = setup.knots, setup.times.goals
+    args, goals = begun.plain.args if begun.plain else begun.args, setup.times.goals
+    knots = setup._replace(inputs=args[2]).knots
     # zeros stand for sampled inputs, which the kernel interpolates
     known, plain = (
         tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
         for part in (known_of(begun.args), known_of(begun.plain.args) if begun.plain else ())
     )
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
-    samples, control = _samples(begun.args, goals, knots), control_of(setup, knots)
-    return Start(samples, control, goals, origin, (begun.y0.rows,), (known,), modes, plain)
+    samples, control = _samples(args, goals, knots), control_of(setup, knots)
+    tables = tuple(jax.tree.leaves([x for x in begun.args[2].channels if isinstance(x, Sampled)]))
+    return Start(samples, control, goals, origin, (begun.y0.rows,), (known,), modes, plain, tables)
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:

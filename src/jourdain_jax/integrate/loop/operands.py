@@ -40,8 +40,9 @@ class Operands(NamedTuple):
                 row += len(constant[row])
             else:
                 x, rank = values[k := operands.pop(0)], self.ranks[k]
-                found.append((x, rank, x.ndim == rank == 0))
-                row += x.shape[-1] if rank else 1
+                if count := x.shape[-1] if rank else 1:
+                    found.append((x, rank, x.ndim == rank))
+                row += count
         return found
 
     def shared(self, values: Sequence) -> tuple[bool, ...]:
@@ -65,6 +66,7 @@ class Operands(NamedTuple):
             part = lax.concatenate(each, 0)
             part = lax.transpose(part, (*range(1, part.ndim), 0))
             found.append(self._laned(part, 1) if laned else part)
+        found = found or [np.zeros(1, dtype)]  # nothing reads the number of an array without rows
         return lax.concatenate(found, found[0].ndim - 1)
 
     def side_by_side(self, *values: Array) -> list[Array]:
@@ -78,15 +80,13 @@ class Operands(NamedTuple):
         axis, after that of the other rows. If all lanes share the times, these have no batch axis either. The
         number of trial steps is the largest of the batch.
         """
-        if not self.others:
-            return self.side_by_side(*values)
         rows, last, end = self._rows(values), len(values) - self.others, len(values) - self.counted
         starts = [
             self._joined([x for x in rows if x[2] is shared], values[-1].dtype, not shared)
             for shared in (False, True)
         ]
         others = [*map(self._laned, values[last:end], self.ranks[last:end])]
-        if values[end - 1].ndim == self.ranks[end - 1]:
+        if others and values[end - 1].ndim == self.ranks[end - 1]:
             others[-1] = values[end - 1]
-        tries = [lax.reduce_max(x, range(x.ndim)) for x in values[end:]]
+        tries = [lax.reduce_max(lax.expand_dims(x, (0,)), range(1, x.ndim + 1)) for x in values[end:]]
         return [*values[: self.samples], *starts, *others, *tries]

@@ -222,9 +222,9 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
     there = np.flatnonzero([n != graph.zero for n in nodes])
 
     @cache
-    def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
-        """Return the derivative as a function of the concatenation of x, v or g, and w; None if it is too
-        large or cannot be compiled to machine code.
+    def derivative(back: bool, order: int) -> Callable[..., Array] | None:
+        """Return the derivative as a function of the parts of x, v or g, and w; None if it is too large or
+        cannot be compiled to machine code.
         """
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
@@ -246,64 +246,66 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
             return None
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
-    def linear(back: bool) -> Callable[[Array, Array], Array]:
+    def linear(back: bool) -> Callable[[tuple, tuple], Array]:
         """Return the Jacobian-vector product as a function of x and v, or, with `back`, the vector-Jacobian
         product as a function of x and g. Its derivative along x is machine code if possible.
         """
 
-        def taken(v):
-            return v[there] if back else v
+        def taken(v: tuple) -> tuple:
+            return tuple(g[there] for g in v) if back else v
 
         @jax.custom_jvp
-        def first(x, v):
+        def first(x: tuple, v: tuple):
             if (by_graph := derivative(back, 1)) is not None:
-                return by_graph(jnp.concatenate([x, taken(v)]))
-            return jax.vjp(by_xla, x)[1](v)[0] if back else jax.jvp(by_xla, (x,), (v,))[1]
+                return by_graph(*x, *taken(v))
+            return jnp.hstack(jax.vjp(by_xla, *x)[1](*v)) if back else jax.jvp(by_xla, x, v)[1]
 
         @partial(first.defjvp, symbolic_zeros=True)
         def rule(at, tangents):
-            (x, v), (dx, dv) = at, tangents
-            found, second = first(x, v), None if is_zero(dx) else derivative(back, 2)
-            if not is_zero(dx) and second is None:
-                return jax.jvp(first.fun, at, (dx, filled(dv)))
-            rates = [] if is_zero(dv) else [first(x, dv)]
-            rates += [second(jnp.concatenate([x, taken(v), dx]))] if second else []
+            (x, v), (dx, dv) = at, (tuple(map(filled, part)) for part in tangents)
+            still, found = all(map(is_zero, tangents[0])), first(x, v)
+            second = None if still else derivative(back, 2)
+            if not still and second is None:
+                return jax.jvp(first.fun, at, (dx, dv))
+            rates = [] if all(map(is_zero, tangents[1])) else [first(x, dv)]
+            rates += [second(*x, *taken(v), *dx)] if second else []
             return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
 
         return first
 
     along, back = linear(False), linear(True)
 
-    def push(arguments, tangents):
-        return values(*arguments), along(*arguments, *tangents)
+    def push(x: tuple, tangents: tuple):
+        v = tuple(jnp.zeros_like(a) if d is None else d for a, d in zip(x, tangents, strict=True))
+        return values(*x), along(x, v)
 
-    def pull(perturbed, arguments, found, g):
-        return (back(*arguments, g),)
+    def pull(perturbed, x: tuple, found, g):
+        parts = jnp.split(back(x, (g,)), np.cumsum([a.size for a in x])[:-1])
+        return tuple(part.reshape(a.shape) for part, a in zip(parts, x, strict=True))
 
     values = with_rules(by_machine_code, Rules(push, pull))
-    return lambda *parts: values(jnp.hstack(parts).astype(real_type()))
+    return lambda *parts: values(*(jnp.asarray(x, real_type()) for x in parts))
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Return two functions from values of variables to values of nodes, by XLA and by machine code. Machine
-    code returns only nonzero nodes, because the whole matrix of 32 trailers would not fit on its stack.
+    """Return two functions from parts of x to values of nodes, by XLA and by machine code. Machine code
+    returns only nonzero nodes, because the whole matrix of 32 trailers would not fit on its stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
     in_order = bool(number) and np.array_equal(which, np.arange(len(number)))
     kernel = nodes_called(graph, list(number), variables, effort=0)
 
-    def placed(found, x):
-        return found if in_order else jnp.append(found, jnp.zeros((), x.dtype))[which]
+    def placed(found):
+        return found if in_order else jnp.append(found, jnp.zeros((), found.dtype))[which]
 
-    def by_xla(x):
-        found = [
-            jnp.asarray(value, x.dtype)
-            for value in run(graph, list(number), dict(zip(variables, x, strict=True)))
-        ]
-        return placed(jnp.stack(found) if found else x[:0], x)
+    def by_xla(*parts):
+        x = jnp.hstack(parts)
+        values = run(graph, list(number), dict(zip(variables, x, strict=True)))
+        found = [jnp.asarray(value, x.dtype) for value in values]
+        return placed(jnp.stack(found) if found else x[:0])
 
-    return by_xla, lambda x: placed(kernel(x), x)
+    return by_xla, lambda *parts: placed(kernel(*parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,9 +329,9 @@ class Beside:
             return self.program.fixed_values(scene)
         return entries_of(self.fixed(*parameters))
 
-    def speeds_and_pivot(self, *state) -> tuple[Speeds, Scalar | None]:
-        """Return the values of `Lowered.speeds_and_pivot`."""
-        found, count = self.numbers(*state), len(self.program.speeds)
+    def speeds_and_pivot(self, plain: tuple, *state) -> tuple[Speeds, Scalar | None]:
+        """Return the values of `Lowered.speeds_and_pivot`. `plain`: as in `VectorField.speeds_and_pivot`."""
+        found, count = self.numbers(plain, *state[1:]), len(self.program.speeds)
         u = with_derivatives_of(lambda _, *state: self.speeds(*state), found[:count], *state)
         return u, smallest_pivot(found[count:])
 

@@ -163,7 +163,7 @@ class MinimalByMatrices(ByMatrices):
     def speeds(self, at: Instant) -> Speeds:
         return self._kinematics(at).u
 
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar]:
+    def speeds_and_pivot(self, at: Instant, plain: tuple) -> tuple[Speeds, Scalar]:
         """Return all speeds, and the pivot with the sign of det A_z."""
         found = self._kinematics(at)
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
@@ -225,7 +225,7 @@ class FullByMatrices(ByMatrices):
     def speeds(self, at: Instant) -> Speeds:
         return at.y.v
 
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
+    def speeds_and_pivot(self, at: Instant, plain: tuple) -> tuple[Speeds, Scalar | None]:
         if not isinstance(self.reduction, Privileged | GibbsAppell):
             return at.y.v, None
         found = bare_accelerations(at.scene, at.t, at.y.q, at.y.v, at.inputs, reduction=self.reduction)

@@ -247,12 +247,12 @@ class VectorField(eqx.Module):
         """Return all speeds."""
 
     @abc.abstractmethod
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
+    def speeds_and_pivot(self, at: Instant, plain: tuple) -> tuple[Speeds, Scalar | None]:
         """Return all speeds, and a pivot that measures how well the independent speeds determine the others.
         Where they cease to determine them, the pivot passes through zero and changes its sign.
 
         For the full state it is the pivot of the reduction, without a sign. It is None if no speed is
-        eliminated.
+        eliminated. `plain`: `at.fixed` without derivatives; numbers that all lanes share have no batch axis.
         """
 
     def motion(self, at: Instant) -> Motion:
@@ -351,8 +351,10 @@ class ByProgram(VectorField):
     def speeds(self, at: Instant) -> Speeds:
         return self.program.all_speeds(*at.of_program)
 
-    def speeds_and_pivot(self, at: Instant) -> tuple[Speeds, Scalar | None]:
-        return (self.native or self.program).speeds_and_pivot(*at.of_program)
+    def speeds_and_pivot(self, at: Instant, plain: tuple) -> tuple[Speeds, Scalar | None]:
+        if self.native:
+            return self.native.speeds_and_pivot(plain, *at.of_program)
+        return self.program.speeds_and_pivot(*at.of_program)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
         state = self.fixed(scene), t, q, u, inputs
