@@ -11,6 +11,7 @@ from derivatives import with_value
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
+from jourdain_jax.bicycle import measured_bicycle, shipped_bicycles
 
 G = 9.81
 
@@ -149,12 +150,86 @@ def test_bounces_and_rest():
     assert_allclose(time, 2.47360446364125, rtol=1e-12)
     assert_allclose(slopes, [8.53571984478680, 1.23680223182063], rtol=1e-10)
     motion = jj.simulate(Ball(bounce=0.7), {"z": 1.0285}, ts=[2.5, 3.0], rtol=1e-10, atol=1e-10)
-    last = np.flatnonzero(np.isfinite(motion.phases.ts))[-1]
-    assert_allclose(
-        motion.phases.ts[last], 2.55863396558581, atol=1e-6
-    )  # closed where the rebound is below 1e-6 m/s
     assert motion.phase("cloth").tolist() == [0, 1]
     assert_allclose(motion["z"][-1], 0.0285, rtol=1e-14)
+
+
+def at_rest(motion):
+    """The time at which the bounces of the only contact end."""
+    return jnp.min(jnp.where(motion.phases.modes[0, 1:] > 0, motion.phases.ts, jnp.inf))
+
+
+def settled(bounce, **options):
+    """A ball after its bounces."""
+    options = {"rtol": 1e-10, "atol": 1e-10} | options
+    return jj.simulate(Ball(bounce=bounce), {"z": 1.0285, "x_rate": 0.1}, ts=[0.4, 3.0], **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"backend": "xla"}])
+def test_bounces_end_at_the_limit_of_their_series(options):
+    motion = settled(0.7, **options)
+    assert_allclose(at_rest(motion), 2.55863396558581, rtol=1e-11)
+    for derivative in (jax.jacfwd, jax.grad) if not options else (jax.jacfwd,):
+        assert_allclose(
+            derivative(lambda e: at_rest(settled(e, **options)))(0.7), 10.0338586885718, rtol=1e-9
+        )
+    assert_allclose(motion.energies().balance, 0.17 * (G * 1.0285 + 0.1**2 / 2), rtol=1e-11)
+
+
+def test_bounces_by_lanes_end_at_the_limits_of_their_series():
+    e = jnp.array([0.0, 0.1, 0.3, 0.5, 0.6, 0.69, 0.2])
+    found = jax.vmap(lambda e: at_rest(settled(e)))(e)
+    assert_allclose(found, np.sqrt(2 / G) * (1 + e) / (1 - e), rtol=1e-10)
+
+
+class Tilted(Ball):
+    """A ball on a slope, in coordinates along it."""
+
+    slope: float = jj.parameter(0.2)
+
+    def loads(self, motion):
+        weight = self.mass * self.g * jnp.stack([jnp.sin(self.slope), jnp.zeros(()), -jnp.cos(self.slope)])
+        return (jj.Load(forces={"ball": weight}),)
+
+
+def by_hand(bounce, friction, t1):
+    """x, its rate and the time of rest of a ball that falls 0.5 m onto a slope of 0.2: 200 flights, then
+    rolling or slip. Impacts slip or stick.
+    """
+    down, up, R = G * jnp.sin(0.2), G * jnp.cos(0.2), 0.0285
+    t = jnp.sqrt(1.0 / up)
+    w, x, v, turn = up * t, down * t * t / 2, down * t, 0.0 * t
+
+    def bounces(_, state):
+        t, w, x, v, turn = state  # speed of impact; `turn`: rate about y
+        slip, most = v - R * turn, friction * (1 + bounce) * w
+        P = -jnp.clip(2 / 7 * slip, -most, most)
+        v, turn, w = v + P, turn - 2.5 * P / R, bounce * w
+        flight = 2 * w / up
+        return t + flight, w, x + v * flight + down * flight**2 / 2, v + down * flight, turn
+
+    t, _, x, v, turn = jax.lax.fori_loop(0, 200, bounces, (t, w, x, v, turn))
+    slip, held = v - R * turn, 2 / 7 * down
+    a, rest = down - jnp.where(slip > 1e-9, friction * up, held), t1 - t
+    return jnp.stack([x + v * rest + a * rest**2 / 2, v + a * rest, t])
+
+
+@pytest.mark.parametrize("friction", [0.5, 0.04])
+def test_a_ball_bounces_down_a_slope_and_goes_on(friction):
+    """It rolls, or slips to the end, after bounces; their sum has all their impulse of friction."""
+
+    def found(bounce):
+        scene = Tilted(bounce=bounce, friction=friction)
+        motion = jj.simulate(scene, {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
+        return jnp.stack([motion["x"][-1], motion["x_rate"][-1], at_rest(motion)])
+
+    right = lambda bounce: by_hand(bounce, friction, 1.9)
+    assert_allclose(found(0.55), right(0.55), rtol=1e-10)
+    slopes = jax.jacfwd(right)(0.55)
+    assert_allclose(jax.jacfwd(found)(0.55), slopes, rtol=1e-9, atol=1e-12)
+    assert_allclose(jax.jacrev(found)(0.55), slopes, rtol=1e-9, atol=1e-12)
+    motion = jj.simulate(Tilted(bounce=0.55, friction=friction), {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
+    assert motion.phase("cloth")[-1] == (1 if friction > 0.1 else 2)
 
 
 def test_trend_of_a_bounce():
@@ -830,3 +905,73 @@ def test_a_body_with_friction_sets_off_from_its_event():
     assert lanes.event.tolist() == [-1, -1, 0, 0]
     assert_allclose(lanes.t_end, [0.5, 0.5, 0.0, 0.0], atol=1e-9)
     assert_allclose(lanes.q_end[1, 0], 0.125 / 1.4, atol=1e-9)
+
+
+class Braking(jj.Scene):
+    """A bicycle in its plane: the rear wheel turns, all else is one body, since the front wheel is locked."""
+
+    mass: float = jj.parameter(16.0, positive=True)  # of this body; x, z: its centre, from the rear contact
+    inertia: float = jj.parameter(3.0, positive=True)
+    x: float = jj.parameter(0.5)
+    z: float = jj.parameter(0.5)
+    wheel: float = jj.parameter(3.0, positive=True)
+    turning: float = jj.parameter(0.15, positive=True)
+    rear: float = jj.parameter(0.34, positive=True)
+    front: float = jj.parameter(0.34, positive=True)
+    base: float = jj.parameter(1.1, positive=True)
+    friction: float = jj.parameter(0.5)
+    coordinates = jj.coordinates("x z pitch turn")
+
+    def bodies(self, t, q):
+        R, hub = jj.rot_y(q.pitch), jnp.stack([q.x, 0.0 * q.x, q.z])
+        I, J = (jnp.stack([1.0, x, 1.0]) for x in (self.inertia, self.turning))
+        return {
+            "frame": jj.RigidBody(self.mass, I, hub + R @ jnp.stack([self.x, 0.0, self.z - self.rear]), R),
+            "wheel": jj.RigidBody(self.wheel, J, hub, jj.rot_y(q.turn)),
+        }
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        law = {"height": "row", "friction": self.friction}
+        axle = jnp.stack([self.base - self.x, 0.0, self.front - self.z])
+        return {
+            "front": jj.ball_contact(pose["frame"], self.front, centre=axle, **law),
+            "rear": jj.ball_contact(pose["wheel"], self.rear, **law),
+        }
+
+
+def braking(v):
+    """Parameters of `Braking` of a measured bicycle, and the friction (w - b)/h beyond which it tips over."""
+    parts = ("B", v["xB"], v["zB"]), ("H", v["xH"], v["zH"]), ("F", v["w"], -v["rF"])
+    m, x, z = np.array([[v[f"m{name}"], x, -z] for name, x, z in parts]).T
+    mass, x0, z0 = m.sum(), m @ x / m.sum(), m @ z / m.sum()
+    inertia = sum(v[f"I{name}yy"] for name, *_ in parts) + m @ ((x - x0) ** 2 + (z - z0) ** 2)
+    own = {"mass": mass, "inertia": inertia, "x": x0, "z": z0, "wheel": v["mR"], "turning": v["IRyy"]}
+    b, h = mass * x0, mass * z0 + v["mR"] * v["rR"]  # times the whole mass
+    limit = (v["w"] * (mass + v["mR"]) - b) / h
+    return own | {"rear": v["rR"], "front": v["rF"], "base": v["w"]}, limit
+
+
+def test_measured_bicycles_brake():
+    """With the front wheel locked it slides, or the rear wheel lifts: by statics from mu h = w - b on."""
+    names = sorted(shipped_bicycles().keys() - {"Tms"})
+    found = [braking(measured_bicycle(name).values) for name in names]
+    many = {key: jnp.repeat(jnp.array([own[key] for own, _ in found]), 2) for key in found[0][0]}
+    friction = jnp.ravel(jnp.array([[0.95 * limit, 1.05 * limit] for _, limit in found]))
+
+    def stopping(own):
+        scene = Braking(**own)
+        start = {"z": scene.rear, "x_rate": 6.0, "turn_rate": 6.0 / scene.rear}
+        motion = jj.simulate(scene, start, ts=[0.1, 0.2], rtol=1e-9, atol=1e-9)
+        return motion.succeeded, motion.phase("front"), motion.phase("rear"), motion["pitch"]
+
+    succeeded, front, rear, pitch = jax.vmap(stopping)(many | {"friction": friction})
+    assert len(names) == 11
+    assert succeeded.all()
+    assert (front == 2).all()
+    assert (rear[::2] > 0).all()
+    assert (rear[1::2] == 0).all()
+    assert_allclose(pitch[::2], 0.0, atol=1e-12)
+    assert (pitch[1::2, 1] > 0.01).all()

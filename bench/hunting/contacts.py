@@ -15,7 +15,7 @@ import jourdain_jax as jj
 from hunting.family import Ask, Family, G, Truth, drawn, either, one_of
 
 MOST = 200
-LEAST_REBOUND = 1e-6  # m/s, as docs/contacts.md has it
+LEAST_REBOUND = 1e-6  # m/s: slower rebounds are left out here; the engine sums them
 FLIES, ROLLS, SLIPS = range(3)
 
 

@@ -29,6 +29,10 @@ take part with restitution 0 (`coulomb` in `contact_laws.py`). For a single cont
 may integrate over the normal impulse instead. Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications
 (1988).
 
+Bounces shrink by the ratio r of their speeds, and end after 2 w/(a (1 - r)): w speed of rebound, a downward
+acceleration. One flight of this time replaces them where it ends at most `SETTLES` deep in the ground; the
+contact then closes with restitution 0. Its end and 1 are in the place of the direction of slip meanwhile.
+
 `At` holds the switching contacts at one state: their modes and their response to forces.
 """
 
@@ -115,6 +119,8 @@ class At:
         self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
+        self.slots = motion.q.array[-2 * len(self.number) :].reshape(-1, 2)
+        self.settles = (self.number == FLIES) & (self.slots[:, 1] > 0)
 
     @property
     def forces(self) -> ContactVectors:
@@ -150,7 +156,8 @@ def switched(scene: Scene, motion: Motion, numbers: PerContact, q, u) -> Motion:
     return motion_at(scene, motion.t, q, u, inputs)
 
 
-LEAST_REBOUND = 1e-6  # physics, m/s: below this speed of rebound a contact closes
+# numerics, m: greatest depth below the ground of the flight that sums bounces; less makes round-off larger
+SETTLES = 1e-11
 
 
 class Changes(NamedTuple):
@@ -174,7 +181,7 @@ def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> Str
     """Return the impulses of an impact: by `impulse` at contact i, or by Moreau's law at all contacts at
     once.
     """
-    e_n = jnp.where(strikes & (-at.restitution * at.w[:, 0] > LEAST_REBOUND), at.restitution, 0.0)
+    e_n = jnp.where(strikes & ~at.settles, at.restitution, 0.0)
     no, w = jnp.zeros_like(touches), at.found.rows.w
     target, mu = -e_n * at.w[:, 0], at.friction
     law = Law(at.found.G, w, target, mu, mu, touches, no, no, at.modes.direction)
@@ -202,8 +209,9 @@ class After:
     def __init__(self, at: At, i: int, changes: Changes):
         self.at, self.i, (strikes, stops, begins) = at, i, changes
         scene, motion, rows = at.scene, at.motion, at.found.rows
-        struck = _struck(at, (at.number != FLIES) | strikes, strikes, i)
         hits, goes_on = jnp.any(strikes), jnp.any(begins)
+        closed = (at.number != FLIES) | (hits & at.settles)
+        struck = _struck(at, closed | strikes, strikes, i)
         held = at.modes._replace(rolls=jnp.where(stops, 1.0, at.modes.rolls))
         stopping = responses(at.found.G, rows.w[:, None], held, at.friction)[:, 0]
         P = jnp.where(goes_on, 0.0, jnp.where(hits, struck.P.ravel(), stopping))
@@ -212,8 +220,7 @@ class After:
         gained = 0.5 * P @ (rows.w + w.ravel())
         self.u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
 
-        closed = at.number != FLIES
-        touches = jnp.where(goes_on, closed, (closed | strikes) & (w[:, 0] < LEAST_REBOUND))
+        touches = jnp.where(goes_on, closed, (closed | strikes) & (w[:, 0] < LEAST_SLIP))
         slides = touches & jnp.where(goes_on, at.number >= SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
         e = jnp.where((slides & ~goes_on)[:, None], unit(w[:, 1:]), at.modes.direction)
         slipping = jnp.where(moves(w, SLOW), float(SLIPS), float(CREEPS))
@@ -225,12 +232,20 @@ class After:
         rest = coulomb(Law(*response, touches, slides, begins, e))
         numbers = jnp.where(slides, numbers, jnp.where(rest.modes.rolls > 0, float(ROLLS), float(CREEPS)))
         numbers = jnp.where(rest.modes.closed > 0, numbers, float(FLIES))
-        self.e, self.direction = rest.modes.direction, rest.modes.direction[i]
+        self.direction = rest.modes.direction[i]
+        bounces = strikes & (numbers == FLIES) & (at.w[:, 0] < -w[:, 0])
+        falls = -(then.found.G @ rest.P.ravel() + then.found.b)[::3]
+        share = 1 + w[:, 0] / jnp.where(bounces, at.w[:, 0], 1.0)
+        settles = bounces & (falls > 0) & (2 * w[:, 0] ** 2 <= SETTLES * falls * share**2)
+        rests = motion.t + 2 * w[:, 0] / jnp.where(settles, falls * share, 1.0)
+        waits = jnp.where((at.settles & ~hits)[:, None], at.slots, 0.0)
+        waits = jnp.where(settles[:, None], jnp.stack([rests, zero + 1], axis=1), waits)
+        self.slots = jnp.where((numbers >= SLIPS)[:, None], rest.modes.direction, waits)
 
         has_law = jnp.all(rest.holds) & (~hits | struck.has_law)
         faults = (
             (~has_law, PAINLEVE if len(numbers) == 1 else UNDECIDED),
-            (gained > ROUND_OFF * jnp.abs(P @ rows.w), GAINS_ENERGY),
+            (hits & (gained > ROUND_OFF * jnp.abs(P @ rows.w)), GAINS_ENERGY),
             ((hits & ~struck.is_decided) | ~jnp.isfinite(gained), UNDECIDED),
         )
         if (above := at.above_flat[i]) is not None:
@@ -240,8 +255,7 @@ class After:
         self.numbers = numbers
 
 
-# least share of the ground's response that friction must leave; it is zero at Painleve's paradox
-NEARLY = 1e-4  # numerics
+NEARLY = 1e-4  # numerics: least share of the ground's response that friction leaves; 0 at Painleve's paradox
 # numerics, m/s: slip ends at this speed against its direction; larger than the round-off when it starts
 STOPS = 1e-13
 SAME = 1e-12  # numerics, m: a contact that closes within this gap strikes together with another
@@ -254,7 +268,8 @@ def contact_events(at: At) -> dict[str, Scalar]:
     for i, name in enumerate(at.scene.switching.contacts):
         number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]
         bound, along = at.static[i] * normal, at.modes.direction[i] @ slip
-        events[f"{name} normal"] = jnp.where(number == FLIES, at.found.rows.gap[i], normal)
+        ahead = jnp.where(at.settles[i], at.slots[i, 0] - at.motion.t, at.found.rows.gap[i])
+        events[f"{name} normal"] = jnp.where(number == FLIES, ahead, normal)
         while_closed = along - jnp.where(number == SLIPS, SLOW, -STOPS)
         events[f"{name} tangent"] = jnp.where(
             number == FLIES,
@@ -279,9 +294,8 @@ def contact_changes(at: At) -> dict[str, Event]:
         together = own if at.impacts[i] != "moreau" else own | ((at.found.rows.gap < SAME) & (at.w[:, 0] < 0))
         flying = strikes & (at.number == FLIES) & together
         after = After(at, i, Changes(flying, own & stops, own & (number == ROLLS)))
-        events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
-        # at the start of slip the law at rest gives the direction, even if the contact would stick by
-        # round-off
+        events[f"{name} normal"] = _event(after, strikes, FLIES, jnp.zeros(2))
+        # at the start of slip the law at rest gives the direction, even if the contact sticks by round-off
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
         ends = jnp.asarray(float(PAINLEVE))
@@ -305,8 +319,7 @@ def _event(
     at, i, names = after.at, after.i, after.at.scene.switching.contacts
     numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(mode))
     u = jnp.where(jumps, after.u, at.motion.u.array if u is None else u)
-    e = jnp.where(jumps, after.e, at.modes.direction.at[i].set(e))
-    e = jnp.where((numbers >= SLIPS)[:, None], e, 0.0)
+    e = jnp.where(jumps, after.slots, at.slots.at[i].set(e))
     directions = {f"{name}_slip_{k}": e[j, k - 1] for j, name in enumerate(names) for k in (1, 2)}
     jump = dict(zip(at.scene.speed_names.entries, u, strict=True)) | directions
     return Event(jnp.ones_like(at.motion.t), to=dict(zip(names, numbers, strict=True)), jump=jump)
@@ -328,7 +341,8 @@ def put_back(at: At) -> tuple[PerCoordinate, Speeds]:
     D = jax.jacfwd(gaps)(q)
     moved = solved(list(D @ D.T + jnp.diag(1 - closed)), list(gaps(q)[:, None]))
     q = q - jnp.concatenate(moved) @ D
-    return jnp.append(q[: -modes.direction.size], unit(modes.direction)), _speeds_on_rows(at, at.number)
+    e = jnp.where((closed > 0)[:, None], unit(modes.direction), at.slots)
+    return jnp.append(q[: -e.size], e), _speeds_on_rows(at, at.number)
 
 
 def _speeds_on_rows(at: At, number: PerContact) -> Speeds:
@@ -359,8 +373,8 @@ def contacts_at_start(at: At) -> Begun:
     """Return the modes of the contacts at the start of a motion, and the state in these modes."""
     scene, motion, gap, w = at.scene, at.motion, at.found.rows.gap, at.w
     touches = gap < TOUCHES
-    strikes = touches & (w[:, 0] < -LEAST_REBOUND)
-    closed = touches & (jnp.abs(w[:, 0]) <= LEAST_REBOUND)
+    strikes = touches & (w[:, 0] < -LEAST_SLIP)
+    closed = touches & (jnp.abs(w[:, 0]) <= LEAST_SLIP)
     slips = moves(w, SLOW)
     numbers = jnp.where(closed, jnp.where(slips, float(SLIPS), float(ROLLS)), float(FLIES))
     e = jnp.where((closed & slips)[:, None], unit(w[:, 1:]), 0.0)
@@ -370,8 +384,8 @@ def contacts_at_start(at: At) -> Begun:
     begun = At(scene, switched(scene, motion, numbers, q, u), None, at.responses)
     first = next((i for i, impact in enumerate(at.impacts) if impact != "moreau"), 0)
     after = After(begun, first, Changes(strikes, no, no))
-    numbers, u, e = after.numbers, after.u, jnp.where((after.numbers >= SLIPS)[:, None], after.e, 0.0)
-    q = jnp.append(q[: -e.size], e)
+    numbers, u = after.numbers, after.u
+    q = jnp.append(q[: -e.size], after.slots)
     then = At(scene, switched(scene, motion, numbers, q, u), None, at.responses)
     bears = jnp.stack([(number != SLIPS) | (_bearing(then, i) > NEARLY) for i, number in enumerate(numbers)])
     below = jnp.where(jnp.all(bears & (numbers >= FLIES)), jnp.max(-gap, initial=0.0), jnp.inf)

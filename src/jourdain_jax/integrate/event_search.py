@@ -273,7 +273,8 @@ def monitored(
         w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
         passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
         too_many = repeats | (why > 0.0) | (passed > float(form.transitions))
-        why = w.where(why > 0.0, why, float(result_codes.TOO_MANY_TRANSITIONS))
+        others = w.where(repeats, float(result_codes.ZENO), float(result_codes.TOO_MANY_TRANSITIONS))
+        why = w.where(why > 0.0, why, others)
         changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
         # crossings count as trial steps, which limits their number

@@ -29,6 +29,7 @@ PAINLEVE = 20  # code
 CONTACTS_UNDECIDED = 21  # code
 LIES_FLAT = 22  # code
 STICKS = 23  # code
+ZENO = 24  # code
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 
 MESSAGES = {
@@ -93,9 +94,7 @@ MESSAGES = {
         "jax.config.update('jax_enable_x64', True)"
     ),
     TOO_MANY_TRANSITIONS: (
-        "more than `max_transitions` events after which the motion continues, or events "
-        "within round-off of each other, like the last bounces of a ball: switch to a mode of rest, "
-        "or raise `max_transitions`"
+        "more than `max_transitions` events after which the motion continues: raise `max_transitions`"
     ),
     IMPACT_GAINS_ENERGY: (
         "an impact would gain energy by Newton's restitution and Coulomb's law; use "
@@ -118,6 +117,10 @@ MESSAGES = {
         "a load that jumps pushes the motion back onto its jump from both sides, as `jnp.sign` of a "
         "speed does at rest, so the motion cannot continue; use `friction=` of a contact or "
         "`jj.joint_friction`, which hold at rest, or smooth the load, as with `jnp.tanh`"
+    ),
+    ZENO: (
+        "events follow each other within round-off, like the last bounces of a ball: let an event switch to "
+        "a mode of rest, or use a contact with `friction=`, which comes to rest"
     ),
     UNSOLVED_STEP: (
         "the equations of an implicit step were not solved near the last time; use a shorter "

@@ -14,7 +14,8 @@ called "holds". For a contact `rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
-    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero unless it slips
+    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero unless it slips; the time at
+                                                   which its bounces end, and 1, during their last flight
 
 `equations/phases.py` has the mechanics.
 """

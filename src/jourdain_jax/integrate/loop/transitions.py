@@ -271,7 +271,7 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         this = w.equal(event, float(i)) & switches
         # `slow` is for bounces only, at which the value itself does not jump
         slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))
-        w.store(w.where(slow, float(result_codes.TOO_MANY_TRANSITIONS), w.load(stuck)), stuck)
+        w.store(w.where(slow, float(result_codes.ZENO), w.load(stuck)), stuck)
         left_now = switches & is_left(w, c, rate, noise)
         disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
     p.put("disarmed", disarmed)
