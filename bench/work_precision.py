@@ -33,6 +33,7 @@ def say(text: str) -> None:
 
 def curves(names, quick: bool) -> Iterator[dict]:
     """References and single trajectories."""
+    from figures import figure
     from work_precision_cases import (
         measure,
         ours,
@@ -49,7 +50,7 @@ def curves(names, quick: bool) -> Iterator[dict]:
         problem = PROBLEMS[name]
         reference = problem.truth
         say(f"{name}: {reference.how}; {reference.uncertainty:.1e} from {reference.against}")
-        yield {
+        yield figure("uncertainty of the reference", name, reference.uncertainty) | {
             "reference": name,
             "how": reference.how,
             "against": reference.against,

@@ -28,7 +28,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
     "code tokens of tests": 341_203,
-    "code tokens of bench": 108_326,
+    "code tokens of bench": 108_402,
     "test files that reach private names": 34,
 }
 

@@ -38,14 +38,17 @@ class Record:
     versions: dict[str, str]
 
 
-KEYS = tuple(field.name for field in fields(Record))
+FIGURE = ("figure", "model", "value", "required", "met")  # as in the other scripts: error, nothing required
+KEYS = (*FIGURE, *(field.name for field in fields(Record)))
 
 
 def record(**values) -> dict:
     """A measurement as JSON holds it."""
     if values["kind"] not in KINDS:
         raise ValueError(f"`kind` is {values['kind']!r}, expected one of {KINDS}")
-    return {
+    found = {
         key: None if isinstance(value, float) and value != value else value
         for key, value in asdict(Record(**values)).items()
     }
+    name = "error, {method}, {setting:g} {setting_unit}, {batch} at once".format(**found)
+    return dict(zip(FIGURE, (name, found["problem"], found["error"], None, True), strict=True)) | found
