@@ -691,8 +691,10 @@ def _nothing_kept(monkeypatch):
     monkeypatch.setattr(on_arrays, "SLOTS", 8)
     monkeypatch.setattr(array_functions, "integrands", None)
     lower._lowered.cache_clear()
+    lower._lowered_at.cache_clear()
     yield
     lower._lowered.cache_clear()
+    lower._lowered_at.cache_clear()
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)

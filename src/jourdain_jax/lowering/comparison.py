@@ -231,9 +231,9 @@ def check_against_dense(
 def comparison_probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Return probes at random and symmetric configurations on the geometric constraints, with random speeds.
 
-    At the first probe, parameters are as given, so that no pivot vanishes there. At others they are up to a
-    tenth larger, so that equality by coincidence is not taken for an identity. If the scene is undefined for
-    these parameters, or its moments of inertia are impossible, they are closer to the given ones.
+    Parameters are up to a tenth larger than those of `scene`, so that equality by coincidence is not taken
+    for an identity. If the scene is undefined for these parameters, or its moments of inertia are
+    impossible, they are closer to those of `scene`.
     """
     generator = np.random.default_rng(1)
     # at most 56 probes
@@ -265,7 +265,6 @@ def comparison_probes(scene: Scene, structure: Structure, traced: TracedScene) -
     # try shrinking shares of the parameter variation until the scene is valid
     for tried in (1.0, -1.0, *(0.1**k for k in range(1, 9))):
         share = np.where(possible, share, tried)
-        share[0] = 0.0
         here = probes(share)
         finite = all_finite(here([n for part in traced.motion for n in part.ravel().tolist()]), axis=0)
         possible = finite & ~np.any(_least_moments(traced, here) < least, axis=1)

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.reals import Indices, is_traced
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.rows import names_of_events, stops
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
@@ -33,10 +32,15 @@ from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.coordinates import parameters_of
-from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
+from jourdain_jax.scene.identity import (
+    once_per_class,
+    once_per_values,
+    with_reference_parameters,
+    with_usual_parameters,
+)
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Structure, structure_of, structure_whatever_its_faults
-from jourdain_jax.structure.trace import Variables, named_values, traced_scene
+from jourdain_jax.structure.trace import Variables, traced_scene
 
 # Maximum numbers of operations of a program before simplification, with XLA and with machine code. Larger
 # scenes use dense matrices. With XLA, a program of 20,000 operations takes about a minute longer to compile
@@ -49,9 +53,15 @@ MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000  # tuning
 MOST_TERMS = 200  # tuning: maximum number of terms of one normal form
 
 
+# the part of the structure that decides which program is built
+_DECISIVE = "rank", "redundant_rows", "may_set_in", "affine", "homogeneous", "driven", "varying_inertia"
+_DECISIVE += "potentials_of_inputs", "independent"
+
+
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
     """Return the lowered equations of the scene's class, or the reason why there are none. They are built
-    once per class, shapes, independent speeds and vanishing pivots.
+    once per class, shapes and `_DECISIVE` part of the structure, with the class's default parameters; where
+    these have no admissible state, once per parameter values.
 
     `every_speed`: whether all speeds stay in the state, with multipliers for the constraints (default: only
     if no choice of independent speeds is valid everywhere).
@@ -60,28 +70,12 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
-    kept = every_speed, None if every_speed else structure.independent, structure.redundant_rows
-    kept += structure.affine, structure.driven, structure.varying_inertia, structure.homogeneous
-    kept += structure.potentials_of_inputs, structure.may_set_in
-    if every_speed:
-        kept += structure.dependent_rows, structure.well_conditioned and structure.independent
-    scene = with_reference_parameters(scene)
-    found = _lowered(scene, every_speed, massless, kept)
-    vanishing = () if isinstance(found, NotLowered) else _vanishing(found, scene)
-    return _lowered(scene, every_speed, massless, (*kept, vanishing)) if vanishing else found
-
-
-def _vanishing(program: Lowered, scene: Scene) -> Indices:
-    """Return which pivots that depend only on parameters vanish for the parameters of this scene. Other
-    scenes of its class may have led to these pivots.
-    """
-    fixed = [k for k, n in enumerate(program.pivots) if not program.graph.varies[n]]
-    if not fixed:
-        return ()
-    names = scene.coordinate_names, scene.speed_names, scene.inputs
-    at_zero = named_values(scene, 0.0, *(np.zeros(len(of)) for of in names))
-    sizes = np.abs(Probes(program.graph, at_zero)(program.pivots[k] for k in fixed)[:, 0])
-    return tuple(k for k, size in zip(fixed, sizes, strict=True) if not size >= SMALLEST_PIVOT)
+    kept = {name: getattr(structure, name) for name in _DECISIVE}
+    kept["worst_pivot"] = float(structure.well_conditioned)
+    if every_speed and not structure.well_conditioned:
+        kept["independent"] = ()
+    case = every_speed, massless, tuple(kept.items())
+    return _lowered(scene, *case) or _lowered_at(scene, *case)
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
@@ -103,12 +97,24 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
 
 
 @once_per_class
-def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
-    """Return the program. It depends on the part `kept` of the structure, but not on parameter values."""
+def _lowered(scene: Scene, *case) -> Lowered | NotLowered | None:
+    """Return the program at the class's default parameters; None if they have no admissible state."""
+    usual, stated = with_usual_parameters(scene)
+    try:
+        found = _lowered_at(usual, *case)
+    except ValueError:
+        return None
+    return found if stated or isinstance(found, Lowered) else None
+
+
+@once_per_values
+def _lowered_at(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
+    """Return the program at these parameters, with the part `kept` of the structure."""
     begin = time.perf_counter()
+    structure = replace(structure_whatever_its_faults(scene), **dict(kept))
     try:
         with np.errstate(all="ignore"):  # probes with undefined values are ignored
-            found = _built(scene, structure_whatever_its_faults(scene), every_speed, massless)
+            found = _built(scene, structure, every_speed, massless)
     except NotLowered as reason:
         return NotLowered(str(reason))  # without its traceback
     return replace(found, seconds=time.perf_counter() - begin)

@@ -1,8 +1,8 @@
 """Choose pivots to eliminate a linear system of nodes, such that they are large wherever the system itself is
 regular.
 
-A pivot that is constant or depends only on parameters cannot vanish along the motion and is taken first,
-unless it vanishes for the given parameters.
+A pivot that is constant, or that depends only on parameters and vanishes for no values of their declared
+signs, is taken first. A pivot that vanishes for some parameters is taken last.
 Other pivots are rated by their smallest value over all probes, relative to their row. Among good pivots, the
 one with the least fill-in is taken. If only entries that may vanish remain, two rows and two columns are
 eliminated together if their determinant cannot vanish. For example, the velocity of a hitch in rotated axes
@@ -49,7 +49,7 @@ class _Entry:
     """Quality of an entry as a pivot."""
 
     worst: float  # size relative to its row, at the worst probe
-    fixed: bool  # depends only on parameters
+    fixed: bool  # depends only on parameters, and vanishes for none
 
 
 class Pivots:
@@ -70,7 +70,7 @@ class Pivots:
         self.A, self.right = [list(row) for row in A], [list(row) for row in right]
         self.rows, self.columns = set(range(len(self.A))), set(range(len(self.A[0]) if self.A else 0))
         self._far, self._kept_regular = far, None
-        self._given = [list(row) for row in A]
+        self._given, self._anywhere = [list(row) for row in A], _of_any_parameters(graph)
         self._tall = len(self.rows) > len(self.columns)
         self._sizes: dict[int, np.ndarray] = {}  # size of the terms of each row
         self._entries: dict[int, list[int]] = {}  # columns with structurally nonzero entries, by row
@@ -150,19 +150,17 @@ class Pivots:
             ratio = np.empty((0, 1))
             if columns:
                 ratio = _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
+                ratio[[self._may_vanish(n) for n in nodes]] = 0.0
             worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)  # at any probe
             self._judged[row] = {
-                c: _Entry(w, bool(w > 0) and self._is_fixed(n))
+                c: _Entry(w, bool(w > 0) and not self.graph.varies[n])
                 for c, n, w in zip(columns, nodes, worst, strict=True)
             }
         return self._judged[row]
 
-    def _is_fixed(self, node: int) -> bool:
-        """Return whether a node depends only on parameters and has a constant sign."""
-        graph = self.graph
-        return not graph.varies[node] and (
-            graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node]))
-        )
+    def _may_vanish(self, node: int) -> bool:
+        """Return whether a node depends only on parameters and vanishes for some values of them."""
+        return not (self.graph.varies[node] or self._anywhere.sign(node))
 
     def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
         entry = self.A[row][column]
@@ -185,7 +183,8 @@ class Pivots:
         columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
         places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
         k = columns.index(c)
-        return np.sign(values[k]) * _ratios(values, places, self._sizes_at(places))[k]
+        ratio = np.sign(values[k]) * _ratios(values, places, self._sizes_at(places))[k]
+        return np.where(self._may_vanish(self.A[r][c]), 0.0, ratio)
 
     @property
     def _regular(self) -> np.ndarray:
@@ -260,7 +259,8 @@ class Pivots:
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
-        regular = not graph.varies[determinant] and np.all(
+        lasting = not (graph.varies[determinant] or self._may_vanish(determinant))
+        regular = lasting and np.all(
             np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0)
         )
         return determinant if regular else None
@@ -368,6 +368,15 @@ def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.nda
     largest = largest if sizes is None else np.fmax(largest, sizes)
     with np.errstate(all="ignore"):
         return values / np.where(largest > 0, largest, 1.0)
+
+
+def _of_any_parameters(graph: Graph) -> Probes:
+    """Return probes with parameters of any size and, unless they are declared positive, any sign."""
+    draws = np.random.default_rng(2)
+    size = lambda: 10.0 ** draws.uniform(-3.0, 3.0, 64)
+    sign = lambda node: 1.0 if node in graph.positive else draws.choice([-1.0, 0.0, 1.0], 64)
+    inputs = (n for n, op in enumerate(graph.op) if op == "input" and not graph.varies[n])
+    return Probes(graph, {graph.value[n]: sign(n) * size() for n in inputs})
 
 
 def turns(graph: Graph, node: int) -> bool:

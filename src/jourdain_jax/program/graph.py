@@ -44,6 +44,7 @@ class Graph:
         self.args: list[tuple[int, ...]] = []
         self.value: list = []
         self.varies: list[bool] = []  # depends on time, state or inputs; otherwise computed once per motion
+        self.positive: NodeList = []  # parameters that are declared positive
         self._known: dict = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 

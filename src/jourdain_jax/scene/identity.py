@@ -143,6 +143,20 @@ def with_reference_parameters(scene):
     return jax.tree.unflatten(treedef, leaves)
 
 
+def with_usual_parameters(scene):
+    """Return the scene with the class's defaults as parameters, and numbers near one where there are none;
+    and whether all have defaults.
+    """
+    leaves, treedef = jax.tree.flatten(scene)
+    pairs = list(zip(leaves, _defaults(scene), strict=True))
+    stated = [y is not None and np.shape(y) == np.shape(x) for x, y in pairs]
+    usual = [
+        np.asarray(y, x.dtype) if known else _generic(x, y, place)
+        for place, ((x, y), known) in enumerate(zip(pairs, stated, strict=True))
+    ]
+    return jax.tree.unflatten(treedef, usual), all(stated)
+
+
 def _defaults(scene) -> list:
     """Return the class's default for every leaf of a scene; None for a leaf without one."""
     found: list = []
@@ -151,6 +165,7 @@ def _defaults(scene) -> list:
             continue
         count = len(jax.tree.leaves(getattr(scene, field.name)))
         stated = field.default if field.default_factory is MISSING else field.default_factory()
+        stated = None if stated is MISSING else stated
         default = jax.tree.leaves(stated)
         found += default if len(default) == count else [stated if count == 1 else None] * count
     return found

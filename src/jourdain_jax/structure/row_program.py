@@ -5,7 +5,7 @@
 Unit norms of quaternions count as geometric constraints g.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -18,7 +18,7 @@ from jourdain_jax.program.evaluate import depend_on, part_of
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.scene.coordinates import parameter_faults
-from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
+from jourdain_jax.scene.identity import once_per_class, with_usual_parameters
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import (
     BY_ROWS,
@@ -64,7 +64,7 @@ class RowProgram:
 @once_per_class
 def row_program(scene: Scene) -> RowProgram | None:
     """Return the program of a class of scenes; None if a part of it has no scalar form."""
-    scene = with_reference_parameters(scene)
+    scene, _ = with_usual_parameters(scene)
     try:
         nodes = looked_at(scene)
         graph, traced = nodes.graph, nodes.traced
@@ -150,9 +150,8 @@ def _may_vanish(scene: Scene, looked: LookedAt) -> bool:
     """
     if not checks_inertia(scene):
         return False
-    positive = {f.name for f in fields(scene) if f.metadata.get("positive")}
-    leaves = zip(jax.tree_util.tree_leaves_with_path(scene), looked.traced.parameters, strict=True)
-    others = [n for (path, _), leaf in leaves if path[0].name not in positive for n in leaf.ravel().tolist()]
+    others = [n for leaf in looked.traced.parameters for n in leaf.ravel().tolist()]
+    others = [n for n in others if n not in looked.graph.positive]
     weights = [*looked.traced.at.mass.ravel().tolist(), *looked.traced.at.inertia.ravel().tolist()]
     return any(depend_on(looked.graph, weights, others))
 

@@ -14,7 +14,7 @@ of the parameters.
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import equinox as eqx
 import jax
@@ -298,7 +298,11 @@ def _jaxpr(scene: Scene, of_inputs: tuple[int, ...]):
 
 def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene:
     graph = Graph(MOST_MULTIPLICATIONS, keeps_rules=True)
-    parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
+    leaves = jax.tree_util.tree_leaves_with_path(scene)
+    parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, (_, x) in enumerate(leaves)]
+    positive = {f.name for f in fields(scene) if f.metadata.get("positive")}
+    for (path, _), nodes in zip(leaves, parameters, strict=True):
+        graph.positive += nodes.ravel().tolist() if path[0].name in positive else []
     sizes = {
         "t": (),
         "q": (len(scene.coordinate_names),),
