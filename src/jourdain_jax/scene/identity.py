@@ -6,6 +6,7 @@ compilation. They are determined at a few states, with numbers for the parameter
 the numbers used in place of traced parameters.
 """
 
+import gc
 import sys
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -259,6 +260,21 @@ def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
         _BEFORE.reset(token)
 
 
+@contextmanager
+def all_objects_kept() -> Iterator[None]:
+    """Return a context in which Python does not look for unreachable objects. Graphs and their texts are
+    millions of reachable ones, and each search visits all objects of JAX, too.
+    """
+    looks = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if looks:
+            gc.enable()
+
+
+@all_objects_kept()
 def _described(describe: Callable, scene, case: tuple):
     if (key := (describe.__name__, *case[:1])) in (before := _BEFORE.get()):
         return before[key]

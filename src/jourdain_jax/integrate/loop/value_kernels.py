@@ -2,8 +2,7 @@
 are needed outside its steps.
 
 Arguments have no batch axis; under `vmap`, one call computes the whole batch. A batch runs in the widest
-registers, a single sample in narrow registers, whose instructions are faster. Results do not depend on the
-width.
+registers, a single sample in narrow, faster ones. Results do not depend on the width.
 
     o = f(x),   f'(x) v,   g f'(x),   f''(x) w v,   g f''(x) v          o: values of nodes, x: of variables
 
@@ -48,6 +47,7 @@ from jourdain_jax.lowering.lowered_equations import Lowered, smallest_pivot
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.scene.identity import all_objects_kept
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.row_program import RowProgram
 
@@ -65,11 +65,11 @@ def called(
 
     The first `of_samples` arguments belong to sampled inputs, and lanes may share them. The next argument is
     a sequence of vectors and numbers, the rows of a start; `constant`: its rows that are not passed.
-    `counted`: the last argument is the number of trial steps, which determines the size of the record on a
-    GPU.
+    `counted`: the last argument is the number of trial steps, the size of the record on a GPU.
     """
 
     @cache
+    @all_objects_kept()
     def handler(lanes: int, threads: int) -> str:
         w = MachineWriter(lanes, host.fuses(), threads)
         write(w)
