@@ -20,9 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import Number, is_traced, static
@@ -202,13 +200,14 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
     }
 
 
-def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """Return the result code at the end of the loop, from its last `code`. `h`: length of the next step;
-    `span`: time since the start.
-    """
+def code_at_end(w, form, p):
+    """Return the result code at the end of the loop."""
     # steps that shrank below 0.01 of their average indicate a singularity
-    shrank = (code == result_codes.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
-    return jnp.where(shrank, result_codes.SHRANK, jnp.where(code == RUNNING, result_codes.SUCCESS, code))
+    shrank = p["h"] * p["accepted"] < 0.01 * w.magnitude(p["t"])
+    code = w.where(w.equal(p["code"], result_codes.MAX_STEPS) & shrank, result_codes.SHRANK, p["code"])
+    left = w.sum_of_squares(range(form.q_and_v), lambda i: 0.0 * w.load(p.pointer, i))
+    code = w.where(w.equal(left, 0.0) | w.equal(p["accepted"], 0.0), code, result_codes.NOT_FINITE)
+    return w.where(w.equal(code, RUNNING), result_codes.SUCCESS, code)
 
 
 def off(where: Callable, magnitude: Callable, x, rtol, atol):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.reals import Entries, Flag, PerLane, PerTime, Scalar, eps_of
+from jourdain_jax.calculus.reals import Count, Entries, Flag, PerLane, PerTime, Scalar, eps_of
 from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
@@ -212,8 +212,7 @@ class Plain(NamedTuple):
 class Begun(eqx.Module):
     """Start of the integration."""
 
-    right: Flag  # whether parameters, masses and inertias are valid
-    timely: Flag | np.bool_  # whether the times are consistent
+    code: Count  # result code of an invalid start; RUNNING for any other
     start: State
     args: tuple  # vector field, scene, inputs, the scene's fixed values, origin of time
     y0: Integrated

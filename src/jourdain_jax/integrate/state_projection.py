@@ -141,10 +141,9 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
         near_q, g, guess, arrived = _put_coordinates(scene, t, q, start, guesses)
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
     left = jnp.concatenate([g, phi])
-    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
-    moved_q, moved_u, residual = (
-        jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, jax.lax.stop_gradient(left))
-    )
+    left = stopped(jnp.concatenate([left, 0.0 * near_q, 0.0 * near_u]))  # NaN if a number is not finite
+    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
+    right = ~jnp.isnan(residual) & jnp.all(start.inside(near_q))
     names = scene.coordinate_names, scene.speed_names
     moved = moved_q, moved_u, jnp.where(right, residual, jnp.inf)
     return State(jnp.asarray(t), near_q, near_u, *moved, names, guess.astype(q.dtype)), arrived

@@ -8,6 +8,7 @@ value is negative at the end of a step; dense output then locates it. A value th
 within one step is missed.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -23,6 +24,7 @@ from jourdain_jax.calculus.derivatives import by_modes
 from jourdain_jax.calculus.reals import at_index, static
 from jourdain_jax.integrate import event_values, integrands, result_codes
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
+from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
@@ -103,7 +105,15 @@ class Diffrax(eqx.Module, Integrator):
             partial(self._solved, adjoint)
             for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint())
         )
-        return (forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE))(setup, begun)
+        run = forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE)
+        # a state that is NaN ends the motion at once
+        begins = begun.code == RUNNING
+        y0 = jax.tree.map(lambda x: jnp.where(begins, x, jnp.nan), begun.y0)
+        found = run(setup, replace(begun, y0=y0))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([found.y_end.q, found.y_end.v])))
+        code = jnp.where(finite, found.code, result_codes.NOT_FINITE)
+        code, t_end = jnp.where(begins, code, begun.code), jnp.where(begins, found.t_end, jnp.nan)
+        return replace(found, code=code, t_end=t_end)
 
     def _solved(self, adjoint: diffrax.AbstractAdjoint, setup: Setup, begun: Begun) -> Solved:
         origin, knots = begun.args[4], setup.knots

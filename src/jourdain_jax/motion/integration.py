@@ -20,6 +20,7 @@ from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
+from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.inputs import Inputs, Mode, for_programs, in_phases
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
@@ -157,9 +158,9 @@ def _begin(
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
-    right, start = _without_faults(setup._replace(scene=scene if shared is None else shared), start)
     args = field, scene, setup.inputs, field.fixed(scene) if fixed is None else fixed, setup.t0
-    return Begun(right, timely, start, args, field.pack(start.q, start.u), plain)
+    code = _code_at_start(setup._replace(scene=scene if shared is None else shared), start, timely)
+    return Begun(code, start, args, field.pack(start.q, start.u), plain)
 
 
 def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Solved) -> Trajectory:
@@ -173,8 +174,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     stores = field.with_work and field.of_inputs
     stored_first = field.stored(scene, t0, start.q, inputs(t0)) if stores else None
     puts_back = field.projects and not integrator.own
-    sound = begun.right if begun.timely is np.True_ else begun.right & begun.timely
-    saved = solved.reached & (solved.ts * direction <= solved.t_end * direction) & sound
+    sound = ~jnp.isnan(solved.t_end)  # whether the motion began
+    saved = solved.reached & (solved.ts * direction <= solved.t_end * direction)
     # unreached times may hold any value: compute at the end state, then mark as NaN
     first, last, ys = begun.y0.rows, solved.y_end.rows, jax.vmap(lambda y: y.rows)(solved.ys)
     ts = jnp.concatenate(
@@ -190,9 +191,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         work = y.work
         if stored_first is not None:
             work = work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
-        found = jnp.concatenate([y.q, u, *([] if work is None else [work[None]])])
         state = at.t, y.rows if puts_back else rows, at.inputs
-        return found, pivot, state, step_errors(setup, free, y) if puts_back else None
+        return (y.q, u, work), pivot, state, step_errors(setup, free, y) if puts_back else None
 
     found, pivots, states, moved_by = jax.vmap(at_state)(ts, rows)
     # negative if A_z was singular along the motion; NaN marks an unknown end state and is ignored
@@ -200,7 +200,6 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     if pivots is not None:
         pivots = jnp.append(pivots * jnp.sign(pivots[0]), pivot)
         pivot = jnp.min(jnp.where(jnp.isnan(pivots), jnp.inf, pivots))
-    q, u, work = slice(n := len(start.q)), slice(n, m := n + len(start.u)), m
     causes = []
     if puts_back:
         drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted)
@@ -209,32 +208,36 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         near = energies_near(setup, plain, states, begun.y0.with_rows)
         causes.append((energy_lost(*near, solved.accepted), result_codes.ENERGY_LOST))
     if field.rows_may_contradict:
-        violated = rows_violated(setup, states[0], found[:, q], found[:, u])
+        violated = rows_violated(setup, states[0], *found[:2])
         causes.append((violated, result_codes.CONTRADICTORY_ROWS))
     unwatched = reason_against_watching(setup)
-    result = _result(setup, begun, solved, pivot, causes)
+    result = _result(setup, sound, solved, pivot, causes)
     failed = result > result_codes.EVENT
     # the time of a failure is unknown if no step detected it
     over = (result == result_codes.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > result_codes.EVENT)
     noticed = over | (result == solved.code) | (result == result_codes.NOT_FINITE)
-    beyond = failed & ~(noticed & jnp.append(saved, False))  # for the saved states and the end
+    # for the saved states and the end; concatenations, which XLA does not repeat for each use
+    known, beyond = jnp.append(saved, sound), jnp.append(failed & ~(noticed & saved), failed)
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
-    t_end = t_end if begun.timely is np.True_ else jnp.where(begun.timely, t_end, given.t0)
-    known = jnp.append(saved, sound)  # the saved states and the end
-    found = jnp.where(known[:, None], found[1:], jnp.nan)
-    marked = [found, t_end, start.moved_q, start.moved_u, pivot, transitions]
-    marked = left(asked, [beyond] + [failed] * 4 + [jnp.zeros_like(failed)], marked)
-    found, t_end, moved_q, moved_u, pivot, passed = marked
+    t_end = jnp.where(sound, t_end, given.t0)
+    every = [
+        jnp.where(jnp.reshape(known, (-1, *[1] * (x.ndim - 1))), x[1:], jnp.nan)
+        for x in found
+        if x is not None
+    ]
+    marked = [t_end, start.moved_q, start.moved_u, pivot, transitions, *every]
+    marked = left(asked, [failed] * 4 + [jnp.zeros_like(failed)] + [beyond] * len(every), marked)
+    t_end, moved_q, moved_u, pivot, passed, q, u, *work = marked
     return Trajectory(
         scene=given.scene,
         ts=given.ts,
-        q=found[:-1, q],
-        u=found[:-1, u],
-        work=found[:-1, work] if field.with_work else None,
+        q=q[:-1],
+        u=u[:-1],
+        work=work[0][:-1] if work else None,
         t_end=t_end,
-        q_end=found[-1, q],
-        u_end=found[-1, u],
+        q_end=q[-1],
+        u_end=u[-1],
         result=result,
         event=solved.event,
         accepted=solved.accepted,
@@ -272,47 +275,42 @@ def _phases(
     return Phases(jnp.where(there, ts, jnp.nan), events, modes, lost, names, named)
 
 
-def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
-    """Check parameters, bodies, contacts and the start. Return whether all are valid, and the start: NaN for
-    an invalid sample, which then ends at once.
+def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count:
+    """Check parameters, bodies, contacts, times and the start. Return RUNNING, or the code of the first
+    fault.
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
-    program = None if program is None or unsupported(program.graph, [program.right]) else program
+    program = None if program is None or unsupported(program.graph, program.right) else program
     unneeded = setup.judged or (program is not None and not program.others)
     others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
     if program is None:
         faults = faults_at(scene, *at, others)
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
     else:
         nowhere = np.full(len(program.others), jnp.nan)
-        right = value_kernels.is_right(program, scene, *at, nowhere if unneeded else others.ravel())
-    return right, eqx.tree_at(
-        lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u))
-    )
+        right, finite = value_kernels.are_right(program, scene, *at, nowhere if unneeded else others.ravel())
+    fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
+    code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
+    code = jnp.where(finite, code, result_codes.BAD_START)
+    if timely is not np.True_:
+        code = jnp.where(timely, code, result_codes.BAD_TIMES)
+    return jnp.where(right, code, result_codes.BAD_PARAMETER)
 
 
-def _result(setup: Setup, begun: Begun, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
-    """Return the code of the first condition that holds, or else the code of the integrator. `of_drift`:
-    further conditions for motions that reached their end, with their codes.
+def _result(setup: Setup, sound: Flag, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
+    """Return the result code: the integrator's, or that of a condition found after it. `sound`: whether the
+    start is valid; `of_drift`: conditions for motions that reached their end, with their codes.
     """
-    start, end, code = begun.start, solved.y_end, solved.code
-    eps, finite = eps_of(start.q), lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
-    short = code == result_codes.STEP_TOO_SMALL
-    arrived = code <= result_codes.EVENT
-    causes = [
-        (~begun.right, result_codes.BAD_PARAMETER),
-        *([] if begun.timely is np.True_ else [(~begun.timely, result_codes.BAD_TIMES)]),
-        (~finite(start.q, start.u), result_codes.BAD_START),
-        (~(start.residual <= 1e3 * np.sqrt(eps)), result_codes.INCONSISTENT_START),
-        # if a pivot changed sign or is this small, the independent speeds no longer determine the others
-        *([(pivot < SMALLEST_PIVOT, result_codes.SINGULAR_PARTITION)] if setup.field.needs_pivot else []),
-        (~finite(end.q, end.v), result_codes.NOT_FINITE),
-        (short & ~(setup.tolerances[0] >= eps), result_codes.UNRESOLVED),
-        # if no step succeeds, however short, the accelerations themselves are wrong
-        (short & (solved.accepted == 0), result_codes.NOT_FINITE),
-        *((arrived & is_so, cause) for is_so, cause in of_drift),
-    ]
-    # a reduction, because XLA would repeat a chain of `where` in each derivative that is NaN after a failure
-    first = jax.lax.argmax(jnp.stack([*(is_so for is_so, _ in causes), jnp.array(True)]), 0, np.uint32)
-    return jnp.append(np.array([cause for _, cause in causes], np.int32), code)[first]
+    code, eps = solved.code, eps_of(setup.start.q)
+    # if no step succeeds, however short, the accelerations themselves are wrong
+    short = jnp.where(solved.accepted == 0, result_codes.NOT_FINITE, code)
+    short = jnp.where(setup.tolerances[0] >= eps, short, result_codes.UNRESOLVED)
+    code = jnp.where(code == result_codes.STEP_TOO_SMALL, short, code)
+    for is_so, cause in of_drift[::-1]:
+        code = jnp.where((solved.code <= result_codes.EVENT) & is_so, cause, code)
+    # if a pivot changed sign or is this small, the independent speeds no longer determine the others
+    if setup.field.needs_pivot:
+        code = jnp.where(sound & (pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION, code)
+    return code

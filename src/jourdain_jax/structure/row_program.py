@@ -50,7 +50,7 @@ class RowProgram:
     phi: Indices
     A: Matrix
     M: Matrix | None  # lower triangle; None if too large to be written out
-    right: int  # truth value: parameters and bodies are valid
+    right: Indices  # truth values: parameters and bodies are valid; the state is finite
     others: (
         Indices  # coordinates of other states, on the geometric constraints, on which `right` also depends
     )
@@ -97,9 +97,9 @@ def row_program(scene: Scene) -> RowProgram | None:
     return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
 
 
-def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple[int, list[int]]:
-    """Return the node of a truth value, true for valid parameters, and the coordinates of other states on
-    which it depends.
+def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple[list[int], list[int]]:
+    """Return the nodes of two truth values, for valid parameters and for a finite state, and the coordinates
+    of other states on which they depend.
 
     Parameters are valid if each is finite, has its required sign, causes no fault of `plausibility.CHECKS`
     at the start and at states from `elsewhere`, and leaves no free motion without inertia. The coordinates of
@@ -130,18 +130,20 @@ def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple
     stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
     generic = dict(zip(varying, map(g.const, np.concatenate([np.ravel(x) for x in states[0]])), strict=True))
     free = _inertia_elsewhere(looked, A, M, generic) if M and _may_vanish(scene, looked) else []
-    nodes = [*traced.parameters, *stacked.values(), *free]
+    state = np.array([*traced.q.tolist(), *traced.u.tolist()])
+    nodes = [state, *traced.parameters, *stacked.values(), *free]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
 
-    def right(*given):
+    def right(state, *given):
         faults = [*parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()]
         faults += [without_inertia(*given[-2:])] if free else []
-        return ~jnp.any(jnp.stack([*faults, any_wrong(dict(zip(stacked, given[count:], strict=False)))]))
+        faults += [any_wrong(dict(zip(stacked, given[count:], strict=False)))]
+        return ~jnp.any(jnp.stack(faults)), jnp.all(jnp.abs(state) < jnp.inf)
 
     closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
-    (found,) = interpret(g, closed, [Nodes(x) for x in nodes])
-    node, given = int(as_nodes(g, found)), [n for state in on_rows for n in state]
-    return node, given if any(depend_on(g, [node], given)) else []
+    found = [int(as_nodes(g, x)) for x in interpret(g, closed, [Nodes(x) for x in nodes])]
+    given = [n for state in on_rows for n in state]
+    return found, given if any(depend_on(g, found, given)) else []
 
 
 def _may_vanish(scene: Scene, looked: LookedAt) -> bool:

@@ -29,7 +29,7 @@ from jourdain_jax.integrate.arrays.array_functions import Functions
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter, Pointer, Rows
 from jourdain_jax.integrate.arrays.implicit_stages import tried_by_equations
 from jourdain_jax.integrate.event_search import LOCATING, MOST_STEPS, RUNNING
-from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.explicit_steps import Method, code_at_end
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.adjoint import step_back
 from jourdain_jax.integrate.loop.event_adjoint import event_back, is_located
@@ -169,6 +169,7 @@ class Loop(NamedTuple):
         code, w = self._row("code"), self.writer(start)
         rows = going.rows | {code: jnp.where(going.rows[code] == IDLE, RUNNING * 1.0, going.rows[code])}
         state = self.rows_in(w, going._replace(rows=rows), fixed)
+        w.store(code_at_end(w, self.form, Lanes(w, self.form, state)), state, code)
         end = jnp.concatenate([w.load(state, Rows(0, self.form.returned)), *going.log])
         return Found.of(self.form, ys, end, going.passed.astype(end.dtype)[None])
 

@@ -53,10 +53,11 @@ def loop_of(
         compensated=most * eps > eps**0.5,  # after so many steps, round-off may exceed half of the digits
     )
     known, rest = split(begun.args)
-    numbers = jax.lax.stop_gradient(
-        (() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0]))
+    samples = () if knots is None else (knots,)
+    numbers = jax.lax.stop_gradient((samples, control_of(setup, knots), goals, jnp.zeros_like(goals[0])))
+    return Loop(form, method, rest, most), Start(
+        *numbers, y=(y0.rows,), known=(known,), modes=modes, code=begun.code
     )
-    return Loop(form, method, rest, most), Start(*numbers, y=(y0.rows,), known=(known,), modes=modes)
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:

@@ -10,7 +10,7 @@ reached. If inputs are sampled, their tables and knots are the first arguments (
 import math
 
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
-from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.explicit_steps import Method, code_at_end
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import (
     Lanes,
@@ -300,6 +300,9 @@ def _save(
     with w.when(last < times):
         set_goal(w, lanes, lane, goal_of(w, job, goals, number, last))
     with w.when(last >= times):
+        codes = w.room()
+        w.store(code_at_end(w, form, lanes), codes)
+        lanes.set("code", lane, w.load(codes, lane, "double"))
         end = of_lane(w, ends, count, form.returned + len(form.log) + 1, number)
         handed_out(w, form.returned, lanes.pointer, lane, end)
         if most := form.transitions:

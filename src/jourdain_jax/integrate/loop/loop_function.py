@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.derivatives import filled, is_zero
@@ -35,10 +35,10 @@ Numbers = tuple[PerLane, ...]  # one number per row
 def constant_rows(form: Form) -> dict[int, tuple[float, ...]]:
     """Return the rows that are equal at the start of every motion: values by the index of the first row."""
     rows, begun = form.rows, [0.0] * form.returned
-    for name, x in (("code", float(RUNNING)), ("event", -1.0), ("pivot", math.inf)):
+    for name, x in (("event", -1.0), ("pivot", math.inf)):
         begun[rows[name].start] = x
-    h = rows["h"].start
-    return {form.integrated: tuple(begun[form.integrated : h]), h + 1: tuple(begun[h + 1 :])}
+    first = rows["accepted"].start
+    return {first: tuple(begun[first:])}
 
 
 class Start(NamedTuple):
@@ -56,6 +56,7 @@ class Start(NamedTuple):
     modes: Numbers = ()
     plain: tuple[Array, ...] = ()  # `known`; arrays that all samples share have no batch axis
     tables: tuple[Array, ...] = ()  # of sampled inputs; machine code refuses their derivatives
+    code: Int[Array, "*lanes"] = RUNNING  # result code of an invalid start; RUNNING for any other
 
     def numbers(self) -> Numbers:
         """Return the rows after the state at the start, except `constant_rows`. Rows that all lanes share
@@ -64,7 +65,9 @@ class Start(NamedTuple):
         rtol, atol, shortest, longest, first, most = self.control
         limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
         return (
+            jnp.where(self.code == RUNNING, 0.0, jnp.nan),  # time of a motion that does not begin
             jnp.minimum(jnp.abs(first), longest),
+            jnp.asarray(self.code, self.goals.dtype),
             *limits,
             *self.modes,
             *(x for part in (self.plain or self.known[0], *self.known[1:]) for x in part),

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, Shape, real_type
-from jourdain_jax.integrate.explicit_steps import Method, code_at_end
+from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop import taylor
 from jourdain_jax.integrate.loop.adjoint import flow_back, moved, rates_of_all
@@ -211,7 +211,8 @@ def start_of(setup: Setup, begun: Begun) -> Start:
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
     samples, control = _samples(args, goals, knots), control_of(setup, knots)
     tables = tuple(jax.tree.leaves([x for x in begun.args[2].channels if isinstance(x, Sampled)]))
-    return Start(samples, control, goals, origin, (begun.y0.rows,), (known,), modes, plain, tables)
+    y = (begun.y0.rows,)
+    return Start(samples, control, goals, origin, y, (known,), modes, plain, tables, begun.code)
 
 
 def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
@@ -303,7 +304,6 @@ def solved(form: Form, goals: PerTime, found: Found) -> Solved:
     code, accepted, rejected, event, _, crossings = found.rest.astype(jnp.int32)[1:7]
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     ys = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1])
-    code = code_at_end(code, h, accepted, t)
     most = form.transitions
     passed = NONE_PASSED
     if most:

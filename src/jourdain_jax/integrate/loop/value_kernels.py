@@ -390,11 +390,11 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
     return found
 
 
-def is_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> Flag:
+def are_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> tuple[Flag, Flag]:
     """Return whether the parameters, bodies and contacts of a scene are valid, as checked by
-    `parameter_faults` and `faults_at`.
+    `parameter_faults` and `faults_at`, and whether the state is finite.
     """
     parts = [*entries(scene, program.parameters), t, q, u, inputs, others]
     given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
-    run = nodes_called(program.graph, [program.right], given)
-    return run(*jax.lax.stop_gradient(parts))[0] > 0
+    found = nodes_called(program.graph, program.right, given)(*stopped(parts))
+    return found[0] > 0, found[1] > 0

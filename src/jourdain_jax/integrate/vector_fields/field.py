@@ -122,14 +122,15 @@ class Integrated(eqx.Module):
 
     def with_rows(self, rows: Float[Array, "rows *lanes"]) -> "Integrated":
         """Return a state with the values `rows` and the same numbers of coordinates and speeds."""
-        q, v, *work = jnp.split(rows, np.cumsum([len(self.q), len(self.v)]))
-        return Integrated(q, v, rows[-1] if len(work[0]) else None)
+        # the transpose of a split is one concatenation; slices would be padded and added
+        sizes = len(self.q), len(self.v)
+        q, v, *work = jax.lax.split(rows, (*sizes, *[1] * (len(rows) - sum(sizes))))
+        return Integrated(q, v, work[0][0] if work else None)
 
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
         """Return the state with the values `rows`. `form`: has the numbers of coordinates and speeds."""
-        n, end = form.coordinates, form.q_and_v
-        return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
+        return Integrated(rows[: (n := form.coordinates)], rows[n : form.q_and_v], None).with_rows(rows)
 
 
 class Watched(NamedTuple):
@@ -231,7 +232,9 @@ class VectorField(eqx.Module):
 
     def pack(self, q, u) -> Integrated:
         """Return the integrated state of (q, u)."""
-        v = u if self.independent is None else u[np.array(self.independent, np.uint32)]
+        every = np.arange(len(u)) if self.independent is None else np.array(self.independent, int)
+        runs = np.split(every, np.flatnonzero(np.diff(every) != 1) + 1)
+        v = jnp.concatenate([u[run[0] : run[-1] + 1] if run.size else u[:0] for run in runs])
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def stored(self, scene: Scene, t, q, inputs) -> Scalar:
