@@ -1,7 +1,9 @@
-"""Machine code that is kept on disk."""
+"""Machine code that is kept on disk, and what is said while it is made."""
 
+import io
 import multiprocessing
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -12,6 +14,8 @@ from types import SimpleNamespace
 import machine_code
 import pytest
 
+import jourdain_jax as jj
+from jourdain_jax.calculus import progress
 from jourdain_jax.kernels import ffi, host
 
 OTHER = 12345  # the number of another user
@@ -240,3 +244,28 @@ def test_many_processes_may_write_the_same_code(folder):
     with multiprocessing.get_context("spawn").Pool(4) as pool:
         assert set(pool.map(_write, ["same"] * 12)) == {b"y" * 1_000_000}
     assert [f.name for f in folder.iterdir()] == ["same.o"]
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_long_work_is_announced_in_a_terminal_alone(seen, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return seen
+
+    class Disc(jj.models.TiltingDisc):
+        pass
+
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(host, "folder", lambda: None)  # no machine code of a run before
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    disc = Disc()
+    motion = jj.simulate(disc, {"lean": 0.3}, t1=0.1)
+    said = sys.stderr.getvalue().splitlines()
+    assert motion.result == 0
+    if not seen:
+        assert not said
+        return
+    assert "jourdain-jax: deriving the equations of `Disc`" in said
+    machine_code = re.compile(r"jourdain-jax: compiling [\d,]+ instructions to machine code")
+    assert any(map(machine_code.fullmatch, said))
+    assert "jourdain-jax: compiling `one_motion` by XLA" in said

@@ -14,6 +14,7 @@ import jax
 import jax.extend.core
 import jaxlib.version
 
+from jourdain_jax.calculus.progress import announced
 from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
 F = TypeVar("F", bound=Callable)
@@ -47,20 +48,28 @@ def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
     ignored, because JAX accepts them only for whole programs.
     """
 
+    name = getattr(f, "__name__", "on_arrays")
+
     @lru_cache(maxsize=1024)  # structures of arguments without arrays
     def program(treedef, others, with_options: bool) -> Callable:
         def on_arrays(arrays):
             found, kept = _parted(f(*_whole(arrays, treedef, others)))
             return found, _Kept(kept)
 
-        on_arrays.__name__ = getattr(f, "__name__", "on_arrays")
+        on_arrays.__name__ = name
         chosen = options(*jax.tree.unflatten(treedef, others)) if callable(options) else options
         return jax.jit(on_arrays, compiler_options=chosen if with_options else None)
 
     def run(*arguments):
         arrays, structure = _parted(arguments)
         with_options = options is not None and jax.default_backend() == "cpu" and nothing_is_traced()
-        found, kept = program(*structure, with_options)(arrays)
+        known = program.cache_info().misses
+        call = program(*structure, with_options)
+        if program.cache_info().misses == known:
+            found, kept = call(arrays)
+        else:
+            with announced(f"compiling `{name.strip('_')}` by XLA"):
+                found, kept = call(arrays)
         return _whole(found, *kept.value)
 
     vars(run)["cache_clear"] = program.cache_clear

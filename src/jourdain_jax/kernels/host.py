@@ -25,6 +25,7 @@ import jax
 
 from jourdain_jax.calculus.configuration import MOST_THREADS
 from jourdain_jax.calculus.files import whole_number, write_whole
+from jourdain_jax.calculus.progress import announced
 
 llvm: Any = None
 _NOT_IMPORTED = "llvmlite is not installed"
@@ -135,7 +136,7 @@ def description() -> str:
 def object_code(text: str, effort: int) -> bytes:
     """Return the machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as for `EFFORT`."""
     effort = min(effort, EFFORT)
-    with _lock:
+    with announced(f"compiling {text.count(chr(10)):,} instructions to machine code"), _lock:
         machine, few_passes = _machine(effort), effort < 2
         module = llvm.parse_assembly(text)
         module.triple = llvm.get_process_triple()

@@ -10,6 +10,7 @@ from itertools import islice
 import jax
 import numpy as np
 
+from jourdain_jax.calculus.progress import announced
 from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.equations.rows import names_of_events, stops
 from jourdain_jax.kernels import ffi
@@ -51,7 +52,6 @@ from jourdain_jax.structure.trace import Variables, traced_scene
 # steps included.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000  # tuning
 MOST_TERMS = 200  # tuning: maximum number of terms of one normal form
-
 
 # the part of the structure that decides which program is built
 _DECISIVE = "rank", "redundant_rows", "may_set_in", "affine", "homogeneous", "driven", "varying_inertia"
@@ -113,7 +113,8 @@ def _lowered_at(scene: Scene, every_speed: bool, massless: bool, kept: tuple) ->
     begin = time.perf_counter()
     structure = replace(structure_whatever_its_faults(scene), **dict(kept))
     try:
-        with np.errstate(all="ignore"):  # probes with undefined values are ignored
+        # probes with undefined values are ignored
+        with np.errstate(all="ignore"), announced(f"deriving the equations of `{type(scene).__name__}`"):
             found = _built(scene, structure, every_speed, massless)
     except NotLowered as reason:
         return NotLowered(str(reason))  # without its traceback

@@ -6,7 +6,6 @@ compilation. They are determined at a few states, with numbers for the parameter
 the numbers used in place of traced parameters.
 """
 
-import gc
 import sys
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.progress import all_objects_kept
 from jourdain_jax.calculus.reals import all_finite, is_traced_type, largest
 from jourdain_jax.scene.coordinates import stacked_parameters
 
@@ -258,20 +258,6 @@ def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
         yield
     finally:
         _BEFORE.reset(token)
-
-
-@contextmanager
-def all_objects_kept() -> Iterator[None]:
-    """Return a context in which Python does not look for unreachable objects. Graphs and their texts are
-    millions of reachable ones, and each search visits all objects of JAX, too.
-    """
-    looks = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if looks:
-            gc.enable()
 
 
 @all_objects_kept()

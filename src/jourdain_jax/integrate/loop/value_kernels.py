@@ -36,6 +36,7 @@ from jourdain_jax.calculus.derivatives import (
     with_rules,
 )
 from jourdain_jax.calculus.markers import entries_of, lanes_of, stopped
+from jourdain_jax.calculus.progress import all_objects_kept
 from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.loop.lanes import MachineWriter
@@ -47,7 +48,6 @@ from jourdain_jax.lowering.lowered_equations import Lowered, smallest_pivot
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.scene.identity import all_objects_kept
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.row_program import RowProgram
 
