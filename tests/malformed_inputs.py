@@ -285,6 +285,12 @@ NAMES: dict[str, Case] = {
         "`domain` of `Described` gives (0, 'a') for `x`, expected two finite numbers"
     ),
     "described(example={'z': 1.0})": "`example` of `Described` names `z`, which is not a coordinate or speed",
+    "described(loads=lambda self, t, q, u: ())": (
+        "`loads` of `Described` takes (self, t, q, u), expected (self, motion)"
+    ),
+    "described(geometric_constraints=lambda pose: {})": (
+        "`geometric_constraints` of `Described` takes (pose), expected (self, pose)"
+    ),
     "described(load=lambda self, motion: ())": (
         "`Described` has a method `load`, which nothing calls; did you mean `loads`?"
     ),

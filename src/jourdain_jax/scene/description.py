@@ -140,6 +140,24 @@ def _misspelt(kind: type, base: type) -> str:
                     f"`{kind.__name__}` has {what} `{name}`, which nothing calls; did you mean `{near[0]}`? "
                     f"Rename it, or begin its name with an underscore (`_{name}`)"
                 )
+    return next(filter(None, (_wrong_arguments(kind, base, name) for name in METHODS)), "")
+
+
+def _wrong_arguments(kind: type, base: type, name: str) -> str:
+    """Return an error message about the arguments of a method; empty if they are right or unknown."""
+    expected = inspect.signature(getattr(base, name))
+    try:
+        taken = inspect.signature(getattr(kind, name))
+    except (TypeError, ValueError):  # not a function of Python
+        return ""
+    every = list(expected.parameters)
+    if isinstance(inspect.getattr_static(kind, name), staticmethod | classmethod):
+        every = every[1:]
+    try:
+        taken.bind(*every)
+    except TypeError:
+        given = ", ".join(taken.parameters)
+        return f"`{name}` of `{kind.__name__}` takes ({given}), expected ({', '.join(every)})"
     return ""
 
 
