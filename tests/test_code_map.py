@@ -15,12 +15,12 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 475_279,
+    "code tokens of src": 475_290,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
     "caches": 50,
-    "named numbers": 301,
-    "tests for a tracer": 61,
+    "named numbers": 300,
+    "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,
     "ways: projection of a state onto its constraints": 3,
     "ways: projection of a state after a step": 1,

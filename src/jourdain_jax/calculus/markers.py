@@ -133,10 +133,16 @@ _shown_p, _forwards_p, _tangents_p = (
 )
 
 
+def _look(look: Callable, values, dims) -> None:
+    """Pass known values to `look` as arrays, with their batch axis, of index `dim` or None, first."""
+    if not any(isinstance(x, jax.core.Tracer) for x in values):
+        arrays = zip(map(np.asarray, values), dims, strict=True)
+        look([x[None] if dim is None else np.moveaxis(x, dim, 0) for x, dim in arrays])
+
+
 def _transposed(cotangents, *values, look: Callable):
     cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
-    if not any(isinstance(ct, jax.core.Tracer) for ct in cotangents):
-        look([np.asarray(ct) for ct in cotangents])
+    _look(lambda arrays: look([x[0] for x in arrays]), cotangents, [None] * len(cotangents))
     return cotangents
 
 
@@ -149,19 +155,13 @@ def _pushed(primals, tangents, *, look: Callable):
 
 
 def _seen(*tangents, look: Callable):
-    look([np.asarray(tangent)[None] for tangent in tangents])
+    _look(look, tangents, [None] * len(tangents))
     return list(tangents)
 
 
 def _seen_in_batch(tangents, dims, *, look: Callable):
     """Pass all directions of a `jacfwd` to `look` at once."""
-    if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
-        look(
-            [
-                np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0)
-                for x, dim in zip(tangents, dims, strict=True)
-            ]
-        )
+    _look(look, tangents, dims)
     return list(tangents), dims
 
 

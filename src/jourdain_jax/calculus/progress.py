@@ -6,16 +6,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-PATIENCE = 2.0  # tuning, s: shorter work has no message
-
 
 @contextmanager
 def announced(what: str) -> Iterator[None]:
-    """Return a context that prints `what` to stderr after `PATIENCE`, in a terminal or a notebook only."""
+    """Return a context that prints `what` to stderr after 2 s, in a terminal or a notebook only."""
     seen = sys.stderr.isatty() or "ipykernel" in sys.modules
-    message = threading.Timer(
-        PATIENCE, print, (f"jourdain-jax: {what}",), {"file": sys.stderr, "flush": True}
-    )
+    message = threading.Timer(2.0, print, (f"jourdain-jax: {what}",), {"file": sys.stderr, "flush": True})
     message.daemon = True
     if seen:
         message.start()
