@@ -29,9 +29,9 @@ take part with restitution 0 (`coulomb` in `contact_laws.py`). For a single cont
 may integrate over the normal impulse instead. Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications
 (1988).
 
-Bounces shrink by the ratio r of their speeds, and end after 2 w/(a (1 - r)): w speed of rebound, a downward
-acceleration. One flight of this time replaces them where it ends at most `SETTLES` deep in the ground; the
-contact then closes with restitution 0. Its end and 1 are in the place of the direction of slip meanwhile.
+Bounces whose speeds shrink by the ratio r end after the time 2 w/(a (1 - r)): w speed of rebound, a downward
+acceleration. If one flight ends at most `SETTLES` deep in the ground, it replaces them and the contact closes
+with restitution 0. Meanwhile the slots of the slip direction hold the time at which the flight ends, and 1.
 
 `At` holds the switching contacts at one state: their modes and their response to forces.
 """
