@@ -23,7 +23,6 @@ function observed: files of the package of which some function runs
 import ast
 import importlib
 import inspect
-import io
 import pkgutil
 import re
 import sys
@@ -31,6 +30,7 @@ import threading
 import tokenize
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 from figures import Figures, figure, fresh, main
@@ -72,16 +72,13 @@ TRACERS = {
 MOST_PARAMETERS = 8
 MOST_FILES = {"build": 70, "first": 35, "gradient": 50, "warm": 20}  # of the first model
 MODELS = ("tilting-disc", "skate", "whipple-bicycle")
-LAYOUT = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENDMARKER,
-    tokenize.ENCODING,
-}
-OPENS, CLOSES = (getattr(tokenize, f"FSTRING_{end}", -1) for end in ("START", "END"))  # from Python 3.12 on
+# A comment, a string or another token; f-strings are one string, as for Python 3.11.
+STRING = r"""(?:[rbfu]|[bf]r|r[bf])?(?:'''(?:[^\\]|\\.)*?'''|\"{3}(?:[^\\]|\\.)*?\"{3}"""
+STRING += r"""|'(?:[^\\\n']|\\.)*'|"(?:[^\\\n"]|\\.)*")"""
+TOKEN = re.compile(
+    rf"#[^\n]*|(?P<string>{STRING})|(?P<other>{tokenize.Number}|\w+|{tokenize.Special})",
+    re.DOTALL | re.IGNORECASE,
+)
 
 
 def layers() -> tuple[str, ...]:
@@ -111,20 +108,15 @@ def code_tokens(text: str) -> int:
         node.body[0].lineno
         for node in statements(ast.parse(text))
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and ast.get_docstring(node) is not None
+        and ast.get_docstring(node, clean=False) is not None
     }
-    lines, total, opened = text.splitlines(keepends=True), 0, []
-    place = lambda line, column: sum(map(len, lines[: line - 1])) + column
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == OPENS:
-            opened.append(place(*token.start))
-        elif token.type == CLOSES:
-            begin = opened.pop()
-            total += 0 if opened else 1 + (place(*token.end) - begin - 1) // 40
-        elif not opened and token.type == tokenize.STRING:
-            total += 0 if token.start[0] in documented else 1 + (len(token.string) - 1) // 40
-        elif not opened:
-            total += token.type not in LAYOUT
+    total, line, at = 0, 1, 0
+    for token in TOKEN.finditer(text):
+        if token["string"]:
+            line, at = line + text.count("\n", at, token.start()), token.start()
+            total += 0 if line in documented else 1 + (len(token["string"]) - 1) // 40
+        else:
+            total += token["other"] is not None
     return total
 
 
@@ -133,7 +125,7 @@ def modules_imported(path: Path) -> set[str]:
     a file goes.
     """
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in statements(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -142,6 +134,7 @@ def modules_imported(path: Path) -> set[str]:
     return found
 
 
+@cache
 def _file(module: str) -> Path | None:
     """Return the file of a module of the package or of `tests`."""
     for root in (ROOT / "src", ROOT / "tests"):
@@ -169,6 +162,7 @@ def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
     return known[path]
 
 
+@cache
 def reaching() -> dict[str, list[str]]:
     """Return the private modules that every test file reaches, by the name of the file, where there are
     any.

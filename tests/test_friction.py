@@ -73,8 +73,7 @@ def test_derivatives_of_slip():
 
     numbers = jnp.array([0.2, 3.0, 0.0285])
     first = [-1.17697063655753, 1.56763330222260, -5.13270016244590]
-    for derivative in (jax.jacfwd, jax.grad):
-        assert_allclose(jax.jit(derivative(end))(numbers), first, rtol=1e-9)
+    assert_allclose(jax.jit(jax.grad(end))(numbers), first, rtol=1e-9)
 
 
 def test_derivatives_across_slip():
@@ -224,22 +223,13 @@ def test_a_ball_bounces_down_a_slope_and_goes_on(friction):
         return jnp.stack([motion["x"][-1], motion["x_rate"][-1], at_rest(motion)])
 
     right = lambda bounce: by_hand(bounce, friction, 1.9)
-    assert_allclose(found(0.55), right(0.55), rtol=1e-10)
-    slopes = jax.jacfwd(right)(0.55)
-    assert_allclose(jax.jacfwd(found)(0.55), slopes, rtol=1e-9, atol=1e-12)
-    assert_allclose(jax.jacrev(found)(0.55), slopes, rtol=1e-9, atol=1e-12)
+    slopes, values = with_value(jax.jacfwd, right)(0.55)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found_slopes, found_values = with_value(derivative, found)(0.55)
+        assert_allclose(found_values, values, rtol=1e-10)
+        assert_allclose(found_slopes, slopes, rtol=1e-9, atol=1e-12)
     motion = jj.simulate(Tilted(bounce=0.55, friction=friction), {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
     assert motion.phase("cloth")[-1] == (1 if friction > 0.1 else 2)
-
-
-def test_trend_of_a_bounce():
-    """Without gravity dz(1)/dz0 is -e (google/brax#317)."""
-
-    def end(z, bounce):
-        return jj.simulate(Ball(bounce=bounce, g=0.0), {"z": z, "z_rate": -1.0}, ts=[1.0])["z"][0]
-
-    slope = jax.jit(jax.grad(end))
-    assert_allclose([slope(0.5, e) for e in (1.0, 0.8)], [-1.0, -0.8], rtol=1e-12)
 
 
 class OnSphere(Ball):
@@ -546,23 +536,13 @@ def test_a_start_in_contact():
     struck = jj.simulate(Ball(bounce=0.5), {"z": 0.0285, "z_rate": -1.0}, ts=[0.01])
     assert_allclose(struck["z_rate"], [0.5 - G * 0.01], rtol=1e-12)
 
-    class OnSlope(Ball):
-        def contacts(self, pose):
-            return {
-                "slope": jj.ball_contact(
-                    pose["ball"], self.radius, ground=jj.Plane(tilt=0.5), height="row", friction=self.friction
-                )
-            }
-
-    height = 0.0285 / np.cos(0.5)
-    for friction, phase in (
-        (0.9 * 2 / 7 * np.tan(0.5), 2),
-        (1.1 * 2 / 7 * np.tan(0.5), 1),
-    ):  # mu = (2/7) tan beta divides
-        motion = jj.simulate(OnSlope(friction=friction), {"z": height}, ts=[0.3], **FINE)
-        assert motion.phase("slope").tolist() == [phase]
+    bound = 2 / 7 * np.tan(0.5)
+    for friction, phase in ((0.9 * bound, 2), (1.1 * bound, 1)):
+        slope = Tilted(friction=friction, slope=0.5)
+        motion = jj.simulate(slope, {"z": 0.0285}, ts=[0.15, 0.3], **FINE)
+        assert motion.phase("cloth").tolist() == [phase] * 2
         along = G * (np.sin(0.5) - friction * np.cos(0.5)) if phase == 2 else 5 / 7 * G * np.sin(0.5)
-        assert_allclose(np.hypot(motion["x_rate"], motion["z_rate"]), along * 0.3, rtol=1e-8)
+        assert_allclose(motion["x_rate"][1], along * 0.3, rtol=1e-8)
 
 
 class Cart(jj.Scene):

@@ -241,7 +241,7 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
             L, _ = forces(z[:2], z[2:], modes)
             return np.where(modes == 0, F - np.abs(L), modes * z[2:])
 
-        times = np.linspace(t, end, 3001)[1:]
+        times = np.linspace(t, end, 601)[1:]
         low = np.array([values(s) for s in times]) < 0
         if not low.any():
             y, t = found.y[:, -1], end
