@@ -85,10 +85,3 @@ def test_known_integrals_do_not_change_along_the_motion(scene):
 
     for name, (rate, size) in rates(t, q, u).items():
         assert jnp.max(jnp.abs(rate) / size) <= tolerance("round_off"), name
-
-
-@every_scene
-def test_the_example_starts_on_the_rows(scene, freedoms):
-    start = jj.start(scene, **scene.example)
-    assert start.residual <= tolerance("round_off")
-    assert all(jnp.allclose(start[name], value, rtol=0, atol=0) for name, value in scene.example.items())

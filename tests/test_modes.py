@@ -205,7 +205,7 @@ def test_energy_falls_by_what_events_take():
     assert_allclose(motion.phases.lost[:3], [9.81 * (1 - 0.49) * 0.49**k for k in range(3)], rtol=1e-11)
     assert_allclose(motion.energies().balance, 9.81, rtol=1e-12)
     assert not motion.warnings
-    assert "floor" in str(motion)
+    assert "floor" in str(motion.phases)
     assert "took" in str(motion.phases)
 
 
@@ -348,8 +348,10 @@ def test_block_on_a_belt():
 
 
 def test_of_a_batch_and_a_file(tmp_path):
-    lanes = jj.rollout(Switching(), {"x": jnp.linspace(0.0, 0.2, 3), "x_rate": 1.0, "y": 0.4}, ts=[3.0, 6.0])
-    one = jj.simulate(Switching(), {"x": 0.1, "x_rate": 1.0, "y": 0.4}, ts=[3.0, 6.0])
+    one = switching(NUMBERS)
+    start = {"x": jnp.array([0.0, 0.1, 0.2]), "x_rate": 1.0, "y": 0.4}
+    inputs = {"push": lambda t: 0.13 * jnp.sin(3 * t)}
+    lanes = jj.rollout(one.scene, start, ts=[2.0, 6.0], inputs=inputs, **TIGHT)
     assert_array_equal(lanes.lane(1).phases.ts, one.phases.ts)
     jj.save(one, tmp_path / "motion.npz")
     found = jj.load_trajectory(tmp_path / "motion.npz", Switching)
@@ -395,38 +397,33 @@ def test_a_fit_of_bounces():
         assert_allclose(np.std(found.value), np.mean(found.standard_error), rtol=0.25)
 
 
-class Lifted(jj.Scene):
-    """What has fallen through zero once is lifted above it at 1 s, and falls through it again at once."""
-
-    coordinates = jj.coordinates("y")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, [q.y, 0.0, 0.0])}
-
-    def events(self, motion):
-        return {"falls": jj.Event(motion.q.y), "lifted": jj.Event(1.0 - motion.t, jump={"y": 0.05})}
-
-
-@pytest.mark.parametrize("backend", ["native", "dense"])
-def test_an_event_counts_again_where_another_one_lifts_its_value(backend):
-    motion = jj.simulate(Lifted(), {"y": 0.5, "y_rate": -1.0}, ts=[3.0], backend=backend)
-    assert_allclose(motion.phases.ts[:4], [0.5, 1.0, 1.05, np.nan], rtol=1e-12)
-
-
-class Sunk(Ball):
-    """It strikes, and begins again below its floor: it rises above that for a while, and falls through it
-    again.
+class Again(jj.Scene):
+    """What has fallen through y = 0 is lifted above it at 1 s, and falls through it again at once. A ball
+    strikes its floor, and begins again below it: it rises above that for a while, and falls through it again.
     """
 
+    coordinates = jj.coordinates("y z")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, [q.y, 0.0, q.z])}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 1.0),)
+
     def events(self, motion):
-        return {"floor": jj.Event(motion.q.z, jump={"z": -0.01, "z_rate": 0.3})}
+        return {
+            "falls": jj.Event(motion.q.y),
+            "lifted": jj.Event(1.0 - motion.t, jump={"y": 0.05}),
+            "floor": jj.Event(motion.q.z, jump={"z": -0.01, "z_rate": 0.3}),
+        }
 
 
 @pytest.mark.parametrize("backend", ["native", "dense"])
-def test_an_event_happens_again_that_was_left_within_one_step(backend):
-    motion = jj.simulate(Sunk(0.7, 1.0), {"z": 50.0}, ts=[11.5], backend=backend)
+def test_events_count_again_that_another_one_lifts_or_that_were_left_within_one_step(backend):
+    motion = jj.simulate(Again(), {"y": 0.5, "y_rate": -1.0, "z": 50.0}, ts=[11.5], backend=backend)
     again = 0.3 + np.sqrt(0.3**2 - 2 * 0.01)
-    assert_allclose(motion.phases.ts[:4], [10.0, 10.0 + again, 10.0 + 2 * again, np.nan], rtol=1e-9)
+    expected = [0.5, 1.0, 1.05, 10.0, 10.0 + again, 10.0 + 2 * again, np.nan]
+    assert_allclose(motion.phases.ts[:7], expected, rtol=1e-9)
 
 
 class Timed(OnLine):
@@ -447,24 +444,22 @@ def test_state_and_mode_at_a_saved_time_agree(direction):
     """Where an event and a saved time are a rounding apart, either both are from before the event or both
     from after it.
     """
-    after = set()
-    for k in range(12):
-        t = direction * (0.7 + 0.0317 * k)
-        for at in (np.nextafter(t, -9), t, np.nextafter(t, 9)):
-            scene = Timed(at) if direction > 0 else Back(at)
-            motion = jj.simulate(
-                scene,
-                {"x_rate": 1.0 * direction},
-                t0=0.3 * direction,
-                ts=[t, t + direction],
-                rtol=1e-10,
-                atol=1e-10,
-            )
-            stopped = bool(abs(motion["x_rate"][0]) < 1e-9)
-            assert int(motion.phase("push")[0]) == stopped
-            assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-9)
-            after.add(stopped)
-    assert after == {True, False}
+    t = direction * (0.7 + 0.0317 * np.arange(12))
+    start, kind = {"x_rate": 1.0 * direction}, Timed if direction > 0 else Back
+
+    @jax.jit
+    @jax.vmap
+    def seen(t, at):
+        ts, times = jnp.stack([t, t + direction]), {"t0": 0.3 * direction, "rtol": 1e-10, "atol": 1e-10}
+        motion = jj.simulate(kind(at), start, ts=ts, **times)
+        return motion["x_rate"][0], motion.phase("push")[0], motion.energies().balance
+
+    at = np.concatenate([np.nextafter(t, -9), t, np.nextafter(t, 9)])
+    rate, push, balance = seen(np.tile(t, 3), at)
+    stopped = np.abs(rate) < 1e-9
+    assert_array_equal(push, stopped)
+    assert_allclose(balance, balance[:, :1] + np.zeros(2), atol=1e-9)
+    assert set(stopped.tolist()) == {True, False}
 
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])

@@ -9,26 +9,7 @@ import numpy as np
 
 from .reference import integrate
 
-RUN = {"length": 0.7, "v": 1.2, "w": 0.4, "gamma0": 1.0, "t_end": 5.0}
-
-
-def hitch_angle(t, *, length, v, w, gamma0, t_end=None) -> np.ndarray:
-    """gamma for constant v and w, modulo 2 pi: h = tan(gamma/2) solves a Riccati equation; w = 0: h = h0
-    exp(-v t/L).
-    """
-    t = np.asarray(t, float)
-    rate = np.sqrt(complex((v / length) ** 2 - w**2)) / 2
-    even = np.cosh(rate * t).real
-    odd = t if rate == 0 else (np.sinh(rate * t) / rate).real
-    sine, cosine = np.sin(gamma0 / 2), np.cos(gamma0 / 2)
-    upper = (even - v / (2 * length) * odd) * sine + w / 2 * odd * cosine
-    lower = (even + v / (2 * length) * odd) * cosine - w / 2 * odd * sine
-    return 2 * np.arctan2(upper, lower)
-
-
-def steady_hitch_angle(length: float, v: float, w: float) -> float:
-    """asin(w L / v); beyond |w L / v| = 1 the trailer jackknifes."""
-    return float(np.arcsin(w * length / v))
+RUN = {"length": 0.7, "v": 1.2, "w": 0.4}
 
 
 def steady_radii(radius: float, lengths) -> np.ndarray:

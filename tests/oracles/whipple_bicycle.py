@@ -8,7 +8,6 @@ in these axes; I_zz of a wheel equals its I_xx. `matrices` is the appendix of th
 the constants below are its values to 21 digits.
 """
 
-import mpmath
 import numpy as np
 
 PARAMETERS = {
@@ -55,21 +54,15 @@ DOUBLE_ROOT = 3.78290405129320
 WHEEL_LOADS = {"rear": 612.836470588236, "front": 309.303529411765}  # N, at rest
 
 
-def exact_parameters() -> dict:
-    """The benchmark's parameters as exact decimals in mpmath's current precision."""
-    return {key: mpmath.pi / 10 if key == "lam" else mpmath.mpf(text) for key, text in PARAMETERS.items()}
-
-
-def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
+def matrices(p: dict) -> dict[str, list]:
     """M, C1, K0, K2 as nested lists of the entries, from the 25 parameters (appendix A of the paper).
 
-    Entries are whatever the parameters are: floats, arrays (one bicycle per element) or, with mpmath's cos
-    and sin, mpf.
+    Entries are whatever the parameters are: floats, or arrays with one bicycle per element.
     """
     w, c, lam, r_r, r_f = p["w"], p["c"], p["lam"], p["rR"], p["rF"]
     m_r, m_b, m_h, m_f = p["mR"], p["mB"], p["mH"], p["mF"]
     x_b, z_b, x_h, z_h = p["xB"], p["zB"], p["xH"], p["zH"]
-    cl, sl = cos(lam), sin(lam)
+    cl, sl = np.cos(lam), np.sin(lam)
     # the whole (T)
     m_t = m_r + m_b + m_h + m_f
     x_t = (x_b * m_b + x_h * m_h + w * m_f) / m_t
@@ -132,24 +125,3 @@ def state_matrix(v: float, m=M, c1=C1, k0=K0, k2=K2, gravity: float = 9.81) -> n
     """A of d/dt (roll, steer, roll rate, steer rate)."""
     lower = np.linalg.solve(m, -np.hstack([gravity * k0 + v**2 * k2, v * c1]))
     return np.vstack([np.hstack([np.zeros((2, 2)), np.eye(2)]), lower])
-
-
-def exact_eigenvalues(v, parts: dict, gravity) -> list:
-    """The four roots of det(M s^2 + v C1 s + g K0 + v^2 K2) in mpmath's current precision, for `parts` from
-    `matrices`.
-    """
-    return mpmath.polyroots(exact_polynomial(v, parts, gravity), maxsteps=200, extraprec=200)
-
-
-def exact_polynomial(v, parts: dict, gravity) -> list:
-    """Coefficients of that determinant, highest power first."""
-
-    def entry(i, j):
-        stiffness = gravity * parts["K0"][i][j] + v**2 * parts["K2"][i][j]
-        return [parts["M"][i][j], v * parts["C1"][i][j], stiffness]
-
-    def product(p, q):
-        return [sum(p[i] * q[n - i] for i in range(3) if 0 <= n - i < 3) for n in range(5)]
-
-    left, right = product(entry(0, 0), entry(1, 1)), product(entry(0, 1), entry(1, 0))
-    return [a - b for a, b in zip(left, right, strict=True)]
