@@ -166,7 +166,7 @@ def loop(
         form = array_functions.ArrayForm(
             None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0
         )
-        control = tuple(map(jnp.asarray, (rtol, rtol, 1e-14, longest, dt0, 2000.0)))
+        control = tuple(map(jnp.asarray, (rtol, rtol, longest, dt0, 2000.0)))
         start = Start(
             () if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,)
         )

@@ -122,8 +122,7 @@ def motion(scene: jj.Scene, values: dict, *, first: float | None = None, **optio
     )
     assert not setup.reason_against_machine_code, setup.reason_against_machine_code
     setup = setup if first is None else setup._replace(dt0=jnp.asarray(first) * jnp.sign(setup.t1 - setup.t0))
-    timely = setup.timely
-    return setup.integrator.solved(setup.fitting(timely), integration._begin(setup, timely))
+    return setup.integrator.solved(setup, integration._begin(setup, setup.timely))
 
 
 def pushed(x, v, k, level=-0.1, events=False, **options):

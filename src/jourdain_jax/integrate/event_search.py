@@ -45,6 +45,7 @@ from jourdain_jax.integrate.event_values import (
     first_event,
     is_flat,
     lowest,
+    may_fall,
     no_event,
     reach_of_noise,
     trial,
@@ -183,107 +184,113 @@ def monitored(
             for pair in zip(found, armed(found), strict=True)
         ]
 
-    at_begin = events(t, y, k[0])
-    c_0, rate_0 = armed(at_begin)
-    at_end = events(new["t"], y1, k[1])
-    c_1, rate_1 = armed(at_end)
+    at_begin, at_end = events(t, y, k[0]), events(new["t"], y1, k[1])
+    begin, end = armed(at_begin), armed(at_end)
     locating = w.equal(p["code"], LOCATING)
-    # a motion that starts beyond an event ends at once; a NaN state is not an event
-    sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
-    fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
-    share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
-    sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
+    # most steps are far from events: for them `new` holds
+    names = ["t", "h", "code", "accepted", "rejected", "event", "taken"]
+    names += ["crossings", "passed", "begun"] if form.goes_on else []
+    near = locating | any_of(may_fall(w, h, *begin, *end))
     if form.goes_on:
-        sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
-    again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
-    half = w.room()
-    w.store(0.5, half)
-    w.if_any(again, lambda: w.store(ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), half))
-    dips, share = accept & ((share < 1.0) | again), w.where(again, w.load(half), share)
-    # the trial passed a second zero of a value that rises from zero: use a shorter step
-    restarts = locating & again
-    happened = accept & ~dips & ~no_event(c_1)
-    was_trying, changes, first = search_of(form, p).trying, happened | (locating & ~restarts), w.room()
-    w.store(p["event"], first)
+        near = near | any_of([off > 0.0 for off in p.every("disarmed")])
+    kept = w.room(len(names))
+    for i, name in enumerate(names):
+        w.store(new[name] if name in new else p[name], kept, i)
 
-    def follow() -> None:
-        w.store(
-            w.literal(
-                _follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1)), w.real
-            ),
-            first,
+    def look_closer() -> None:
+        (c_0, rate_0), (c_1, rate_1) = begin, end
+        # a motion that starts beyond an event ends at once; a NaN state is not an event
+        sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
+        fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
+        share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
+        sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
+        if form.goes_on:
+            sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
+        again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
+        dips = accept & ((share < 1.0) | again)
+        share = w.where(again, ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), share)
+        # the trial passed a second zero of a value that rises from zero: use a shorter step
+        restarts = locating & again
+        happened = accept & ~dips & ~no_event(c_1)
+        changes, was_trying = happened | (locating & ~restarts), search_of(form, p).trying
+        first = _follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1))
+        search = search_of(form, p)
+        # trials start at the last state before the event; a step over a dip of a value is repeated up to the
+        # lowest value
+        found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
+        over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
+        shortens = dips | restarts
+        stays = back | shortens | over
+
+        def state(i: int | Number) -> Number:
+            after = w.load(y1, i)
+            return w.where(
+                stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after)
+            )
+
+        each_row(w, form.integrated, y1, state)
+        which = float(count - 1)
+        for i in reversed(range(count - 1)):
+            which = w.where(sunk[i] | sinks[i], i, which)
+        code = w.where(
+            happened, LOCATING, w.where(found, result_codes.EVENT, w.where(locating, LOCATING, new["code"]))
         )
+        code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
+        shorter = share * w.magnitude(h)
+        p["bound"] = w.where(shortens, shorter, p["bound"])  # of Taylor series, whose steps have no `h`
+        changed = {
+            "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
+            "h": w.where(over, p["h"], w.where(shortens, shorter, w.where(locating, p["h"], new["h"]))),
+            "code": w.where(over, result_codes.EVENT, code),
+            "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
+            "rejected": w.where(over, p["rejected"], new["rejected"] + w.where(shortens, 1.0, 0.0)),
+            "event": w.where(over, which, w.where(changes & (happened | was_trying), first, p["event"])),
+            "taken": w.where(stays, 0.0, new["taken"]),
+        }
+        ends = found
+        if form.goes_on:
+            goes = goes_on(w, form, changed["event"]) & (found | over)
+            # rounding may put an event just beyond its step; it then happens at the end of the step
+            now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
+            changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
+            follows = over & (p["passed"] + p["crossings"] > 0.0)
+            at_once = follows & ~goes  # at the same time as a transition before it
+            ends = at_once | (found & ~goes)
+            p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
+            noise = reach_of_noise(w, p["last_goal"])
+            left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
+            p.put(
+                "disarmed",
+                [
+                    w.where(has_left, 0.0, off)
+                    for has_left, off in zip(left, p.every("disarmed"), strict=True)
+                ],
+            )
+            rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
+            side = is_side(w, form, changed["event"])  # numbers of several relations may vanish together
+            flat = ~side & (over | is_flat(w, rate, slope))
+            quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
+            passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
+            stuck, repeats = w.room(), follows & any_of(sinks)
+            w.store(0.0, stuck)
+            w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
+            passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
+            too_many = repeats | (why > 0.0) | (passed > float(form.transitions))
+            others = w.where(repeats, float(result_codes.ZENO), float(result_codes.TOO_MANY_TRANSITIONS))
+            why = w.where(why > 0.0, why, others)
+            changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
+            changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
+            # crossings count as trial steps, which limits their number
+            changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
+            changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
+            changed["event"] = w.where(goes, -1.0, changed["event"])
+        if form.moving:
+            put_tangents(w, form, p, k[0], ends, new["t"], rate_0, y1)
+        for i, name in enumerate(names):
+            w.store(changed[name], kept, i)
 
-    w.if_any(changes, follow)
-    search = search_of(form, p)
-    # trials start at the last state before the event; a step over a dip of a value is repeated up to the
-    # lowest value
-    found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
-    over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
-    stays = back | dips | restarts | over
-
-    def state(i: int | Number) -> Number:
-        after = w.load(y1, i)
-        return w.where(
-            stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after)
-        )
-
-    each_row(w, form.integrated, y1, state)
-    which = float(count - 1)
-    for i in reversed(range(count - 1)):
-        which = w.where(sunk[i] | sinks[i], i, which)
-    code = w.where(
-        happened, LOCATING, w.where(found, result_codes.EVENT, w.where(locating, LOCATING, new["code"]))
-    )
-    code, tried = w.where(restarts, RUNNING, code), w.where(dips, 1.0, 0.0)
-    shorter = share * w.magnitude(h)
-    p["bound"] = w.where(dips | restarts, shorter, p["bound"])  # of Taylor series, whose steps have no `h`
-    changed = {
-        "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
-        "h": w.where(over, p["h"], w.where(dips | restarts, shorter, w.where(locating, p["h"], new["h"]))),
-        "code": w.where(over, result_codes.EVENT, code),
-        "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
-        "rejected": w.where(over, p["rejected"], new["rejected"] + w.where(dips | restarts, 1.0, 0.0)),
-        "event": w.where(over, which, w.where(happened | (locating & was_trying), w.load(first), p["event"])),
-        "taken": w.where(stays, 0.0, new["taken"]),
-    }
-    ends = found
-    if form.goes_on:
-        goes = goes_on(w, form, changed["event"]) & (found | over)
-        # rounding may put an event just beyond its step; it then happens at the end of the step
-        now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
-        changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
-        follows = over & (p["passed"] + p["crossings"] > 0.0)
-        at_once = follows & ~goes  # at the same time as a transition before it
-        ends = at_once | (found & ~goes)
-        p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
-        noise = reach_of_noise(w, p["last_goal"])
-        left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
-        p.put(
-            "disarmed",
-            [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)],
-        )
-        rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
-        side = is_side(w, form, changed["event"])  # numbers of several relations may vanish together
-        flat = ~side & (over | is_flat(w, rate, slope))
-        quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
-        passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
-        stuck, repeats = w.room(), follows & any_of(sinks)
-        w.store(0.0, stuck)
-        w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
-        passed, why = p["passed"] + w.where(goes & ~side, 1.0, 0.0), w.load(stuck)
-        too_many = repeats | (why > 0.0) | (passed > float(form.transitions))
-        others = w.where(repeats, float(result_codes.ZENO), float(result_codes.TOO_MANY_TRANSITIONS))
-        why = w.where(why > 0.0, why, others)
-        changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
-        changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
-        # crossings count as trial steps, which limits their number
-        changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
-        changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
-        changed["event"] = w.where(goes, -1.0, changed["event"])
-    if form.moving:
-        put_tangents(w, form, p, k[0], ends, new["t"], rate_0, y1)
-    return new | changed
+    w.seldom(near, look_closer)
+    return new | {name: w.load(kept, i) for i, name in enumerate(names)}
 
 
 def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:

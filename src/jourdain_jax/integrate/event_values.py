@@ -121,6 +121,17 @@ def is_flat(w, c_dot, slope):
     return w.magnitude(c_dot) <= FLAT * slope
 
 
+def may_fall(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values) -> list:
+    """Return which values may fall through zero in a step `h`. The cubic through values and rates at its ends
+    stays positive if its Bernstein coefficients are positive: c_0, c_0 + h c'_0/3, c_1 - h c'_1/3, c_1.
+    """
+    third = h / 3.0
+    return [
+        ~((a > 0.0) & (b > 0.0) & (a + third * slope_a > 0.0) & (b - third * slope_b > 0.0))
+        for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True)
+    ]
+
+
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
     """Return the fraction of a step `h` at which the first dip below zero between its ends is lowest; 1 if
     there is no dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B

@@ -160,6 +160,11 @@ class Aim(NamedTuple):
     locating: Any  # whether it belongs to an event search
 
 
+def shortest(span):
+    """Return the length of the shortest step of a motion over a `span`, s."""
+    return 1e-14 * span
+
+
 def aimed(w, p, target, reach, shift) -> Aim:
     """Return the next trial step: to the `target` if a step of length `reach` suffices, half of the way if
     two such steps suffice, otherwise of length `reach`. `shift`: the step of an event search, if there is
@@ -187,7 +192,8 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
     accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
     rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
     # the second condition: time would not advance
-    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)
+    too_short = next_h < shortest(w.magnitude(p["last_goal"]))
+    too_short = too_short | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)
     arrived = accept & w.equal(aim.t_1, p["last_goal"])
     code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, result_codes.MAX_STEPS, RUNNING)
     code = w.where(too_short, result_codes.STEP_TOO_SMALL, code)

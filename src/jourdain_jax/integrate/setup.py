@@ -120,18 +120,11 @@ class Times(NamedTuple):
     dt0: Float[Entries, "*lanes"] | float
     longest: Float[Entries, "*lanes"] | float
 
-    def fitting(self, timely: "Flag | np.bool_") -> "Times":
-        """Return times that any loop accepts: clipped to the span, against round-off. A short span replaces
-        inconsistent times.
-        """
-        ts, t0, t1 = self[:3]
-        if timely is np.True_:
-            return self._replace(ts=jax.lax.clamp(jnp.minimum(t0, t1), ts, jnp.maximum(t0, t1)))
-        direction = jnp.sign(t1 - t0)
-        inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-        # a span of 1e-9 s, for motions whose result is not used
-        short = Times(np.linspace(0.0, 1e-9, len(ts)), 0.0, 1e-9, 1e-10, 1e-9)
-        return Times(*(jnp.where(timely, x, y) for x, y in zip(self._replace(ts=inside), short, strict=True)))
+    @property
+    def clipped(self) -> "Times":
+        """Return times whose saved times are clipped to the span, against round-off."""
+        ts, low, high = self.ts, jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
+        return self._replace(ts=jnp.where(ts < low, low, jnp.where(ts > high, high, ts)))
 
     @property
     def goals(self) -> Float[Array, "times *lanes"]:
@@ -169,10 +162,6 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
         forwards = (t1 > t0) | (not self.scene.switching.contacts)
         return ends_fit(ts[0], ts[-1], t0, t1, eps) & in_order & forwards
 
-    def fitting(self, timely: "Flag | np.bool_") -> "Setup":
-        """Return the setup with times that any loop accepts."""
-        return self.at(self.times.fitting(timely))
-
     def at(self, times: Times) -> "Setup":
         """Return the setup with other times."""
         return self._replace(**times._asdict())
@@ -190,11 +179,6 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     def times(self) -> Times:
         """Return the times of the motion."""
         return Times(self.ts, self.t0, self.t1, self.dt0, self.longest)
-
-    @property
-    def shortest(self) -> PerLane:
-        """Return the shortest step, s."""
-        return 1e-14 * jnp.abs(self.t1 - self.t0)
 
     @property
     def knots(self) -> Float[Array, "knots"] | None:

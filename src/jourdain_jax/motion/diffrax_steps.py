@@ -16,6 +16,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
@@ -25,9 +26,10 @@ from jourdain_jax.calculus.reals import at_index, static
 from jourdain_jax.integrate import event_values, integrands, result_codes
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.event_search import RUNNING
+from jourdain_jax.integrate.explicit_steps import shortest
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
 from jourdain_jax.integrate.own_steps import reason_against_watching
-from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
+from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Integrator, Setup, Solved, Times
 from jourdain_jax.integrate.vector_fields.field import Formulation, Instant, Integrated, VectorField
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
@@ -106,14 +108,15 @@ class Diffrax(eqx.Module, Integrator):
             for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint())
         )
         run = forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE)
-        # a state that is NaN ends the motion at once
+        # a state that is NaN ends the motion at once; a span of 1e-9 s stands for times that may not fit
         begins = begun.code == RUNNING
         y0 = jax.tree.map(lambda x: jnp.where(begins, x, jnp.nan), begun.y0)
-        found = run(setup, replace(begun, y0=y0))
+        short = Times(np.linspace(0.0, 1e-9, len(setup.ts)), 0.0, 1e-9, 1e-10, 1e-9)
+        times = (jnp.where(begins, x, y) for x, y in zip(setup.times, short, strict=True))
+        found = run(setup.at(Times(*times)), replace(begun, y0=y0))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([found.y_end.q, found.y_end.v])))
         code = jnp.where(finite, found.code, result_codes.NOT_FINITE)
-        code, t_end = jnp.where(begins, code, begun.code), jnp.where(begins, found.t_end, jnp.nan)
-        return replace(found, code=code, t_end=t_end)
+        return replace(found, code=jnp.where(begins, code, begun.code))
 
     def _solved(self, adjoint: diffrax.AbstractAdjoint, setup: Setup, begun: Begun) -> Solved:
         origin, knots = begun.args[4], setup.knots
@@ -123,7 +126,7 @@ class Diffrax(eqx.Module, Integrator):
             rtol=rtol,
             atol=atol,
             norm=integrands.state_norm,
-            dtmin=setup.shortest,
+            dtmin=shortest(jnp.abs(t1 - t0)),
             dtmax=setup.longest,
             force_dtmin=False,
         )

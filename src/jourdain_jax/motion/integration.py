@@ -62,10 +62,10 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     given = _in_contact(_with_machine_code(_prepared(setup)))
     timely, (setup, asked) = given.timely, _entered(given)
     if setup.reason_against_machine_code:
-        return given, setup.fitting(timely), asked, _begin(setup, timely)
-    plain = _plain(given, timely)
+        return given, setup.at(setup.times.clipped), asked, _begin(setup, timely)
+    plain = _plain(given)
     times, fixed, _ = lanes_first((plain.times, plain.args[3], asked))
-    times = with_derivatives_of(lambda _, times, timely: times.fitting(timely), times, setup.times, timely)
+    times = with_derivatives_of(lambda _, times: times.clipped, times, setup.times)
     fixed = with_derivatives_of(lambda _, field, *of: field.fixed(*of), fixed, setup.field, setup.scene)
     return given, setup.at(times), asked, _begin(setup, timely, given.scene, fixed, plain)
 
@@ -121,11 +121,11 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     return eqx.tree_at(place, setup, eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
-def _plain(setup: Setup, timely: Flag | np.bool_) -> Plain:
+def _plain(setup: Setup) -> Plain:
     """Return the numbers of a setup before `_entered` marks them. Shared numbers have no batch axis."""
     setup = stopped(setup)
     fixed = setup.field.fixed(setup.scene)
-    return Plain(setup.times.fitting(timely), (None, None, setup.inputs, fixed, setup.t0))
+    return Plain(setup.times.clipped, (None, None, setup.inputs, fixed, setup.t0))
 
 
 def _in_contact(setup: Setup) -> Setup:
@@ -174,8 +174,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     stores = field.with_work and field.of_inputs
     stored_first = field.stored(scene, t0, start.q, inputs(t0)) if stores else None
     puts_back = field.projects and not integrator.own
-    sound = ~jnp.isnan(solved.t_end)  # whether the motion began
-    saved = solved.reached & (solved.ts * direction <= solved.t_end * direction)
+    sound = begun.code == RUNNING  # whether the motion began
+    saved = sound & solved.reached & (solved.ts * direction <= solved.t_end * direction)
     # unreached times may hold any value: compute at the end state, then mark as NaN
     first, last, ys = begun.y0.rows, solved.y_end.rows, jax.vmap(lambda y: y.rows)(solved.ys)
     ts = jnp.concatenate(

@@ -66,6 +66,8 @@ class Loop(NamedTuple):
         given |= dict(zip(later, start._replace(known=((),)).numbers(), strict=True))
         given = {row: jnp.broadcast_to(jnp.asarray(x, t.dtype), t.shape) for row, x in given.items()}
         fixed = {row: given[row] for name in CONTROL for row in form.rows[name]}
+        last = start.goals[-1]
+        fixed |= {self._row("last_goal"): last, self._row("direction"): jnp.sign(last)}
         logged = {row for block in self.log for row in block}
         moving = {
             row: given.get(row, jnp.zeros_like(t))

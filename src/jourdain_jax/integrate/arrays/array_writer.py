@@ -164,6 +164,12 @@ class ArrayWriter:
         )
         self._within(rooms, found, lambda: None)
 
+    def seldom(self, condition: Array | bool, body: Callable[[], object]) -> None:
+        """Run the body, which changes no lane in which the condition does not hold: for XLA a branch costs
+        more than a short body.
+        """
+        body()
+
     def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
         """Apply the body to all stages in order, and return its last result."""
         rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))

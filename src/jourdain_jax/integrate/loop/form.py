@@ -27,7 +27,7 @@ from jourdain_jax.lowering.lowered_equations import Lowered
 
 PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot", "crossings")
 SAMPLES = ("table", "samples", "knot")
-CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max_steps", "origin")
+CONTROL = ("rtol", "atol", "longest", "max_steps", "origin")
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,8 @@ class Form:
         }
         counts |= {
             **self.known,
-            "goal": 1,
-            "taken": 1,
-            "before": 1,
-            "bound": 1,
+            **dict.fromkeys(("goal", "last_goal", "direction", "taken"), 1),
+            **dict.fromkeys(("before", "bound"), 1),
             **(search if self.events else {}),
             **dict.fromkeys(SAMPLES if self.sampled else (), 1),
         }

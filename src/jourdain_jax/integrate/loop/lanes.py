@@ -22,6 +22,7 @@ class MachineWriter(Writer):
     its own way:
 
         if_any(c, body)            run the body if c holds in any lane; the body selects lanes by `where`
+        seldom(c, body)            the same, for a body that changes no lane in which c does not hold
         over_stages(n, body, x)    x <- body(i, x) for all stages i
         each(rows, body)           run the body for each row, independently
     """
@@ -40,6 +41,8 @@ class MachineWriter(Writer):
         """Run the body if the condition holds in any lane."""
         with self.when(self.any(condition)):
             body()
+
+    seldom = if_any
 
     def over_stages(self, count: int, body: Callable[[int, Any], Any], found: Any) -> Any:
         """Apply the body to all stages in order, and return its last result."""

@@ -173,6 +173,9 @@ def begin_lane(
     with w.when(there):
         for rows, numbers in _starts(w, form, job, number):
             taken_in(w, len(rows), numbers, w.at(lanes.pointer, rows.start), lane)
+        last = goal_of(w, job, goals, number, w.load(job, TIMES, "i64") - 1)
+        lanes.set("last_goal", lane, last)
+        lanes.set("direction", lane, w.where(last < 0.0, w.literal(-1.0, "double"), 1.0))
         set_goal(w, lanes, lane, goal_of(w, job, goals, number, 0))
     with w.when(~there):
         lanes.set("code", lane, IDLE)

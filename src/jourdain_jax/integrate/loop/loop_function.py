@@ -38,7 +38,7 @@ def constant_rows(form: Form) -> dict[int, tuple[float, ...]]:
     for name, x in (("event", -1.0), ("pivot", math.inf)):
         begun[rows[name].start] = x
     first = rows["accepted"].start
-    return {first: tuple(begun[first:])}
+    return {rows["t"].start: (0.0,), first: tuple(begun[first:])}
 
 
 class Start(NamedTuple):
@@ -47,7 +47,7 @@ class Start(NamedTuple):
     """
 
     of_samples: tuple[Array, ...]  # tables and knots (`samples.py`); for a loop in JAX, only the knots
-    control: Numbers  # rtol, atol, shortest, longest and first step, maximum number of steps
+    control: Numbers  # rtol, atol, longest and first step, maximum number of steps
     goals: Float[Array, "times *lanes"]  # measured from the start
     origin: PerLane  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
@@ -62,13 +62,11 @@ class Start(NamedTuple):
         """Return the rows after the state at the start, except `constant_rows`. Rows that all lanes share
         have no batch axis.
         """
-        rtol, atol, shortest, longest, first, most = self.control
-        limits = jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin
+        rtol, atol, longest, first, most = self.control
         return (
-            jnp.where(self.code == RUNNING, 0.0, jnp.nan),  # time of a motion that does not begin
             jnp.minimum(jnp.abs(first), longest),
             jnp.asarray(self.code, self.goals.dtype),
-            *limits,
+            *(rtol, atol, longest, most, self.origin),
             *self.modes,
             *(x for part in (self.plain or self.known[0], *self.known[1:]) for x in part),
         )

@@ -226,7 +226,7 @@ def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
 
 def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scalar, ...]:
     """Return tolerances and limits of steps in the order of `Start.control`."""
-    control = *setup.tolerances, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots)
+    control = *setup.tolerances, setup.longest, setup.dt0, setup.most_steps(knots)
     return tuple(jnp.asarray(x, real_type()) for x in control)
 
 
