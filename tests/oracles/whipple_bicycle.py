@@ -54,15 +54,16 @@ DOUBLE_ROOT = 3.78290405129320
 WHEEL_LOADS = {"rear": 612.836470588236, "front": 309.303529411765}  # N, at rest
 
 
-def matrices(p: dict) -> dict[str, list]:
+def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
     """M, C1, K0, K2 as nested lists of the entries, from the 25 parameters (appendix A of the paper).
 
-    Entries are whatever the parameters are: floats, or arrays with one bicycle per element.
+    Entries are whatever the parameters are: floats, arrays (one bicycle per element) or, with cos and sin of
+    JAX, values that it traces.
     """
     w, c, lam, r_r, r_f = p["w"], p["c"], p["lam"], p["rR"], p["rF"]
     m_r, m_b, m_h, m_f = p["mR"], p["mB"], p["mH"], p["mF"]
     x_b, z_b, x_h, z_h = p["xB"], p["zB"], p["xH"], p["zH"]
-    cl, sl = np.cos(lam), np.sin(lam)
+    cl, sl = cos(lam), sin(lam)
     # the whole (T)
     m_t = m_r + m_b + m_h + m_f
     x_t = (x_b * m_b + x_h * m_h + w * m_f) / m_t
