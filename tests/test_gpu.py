@@ -164,13 +164,16 @@ def test_samples_that_lanes_share_are_given_once():
         ),
     )
     xs, values = np.linspace(0.4, 0.6, 7), np.array([0.0, 1.0, 0.3])
-    for varied, tables in ((xs, "1x2x3"), (jnp.outer(xs, values), "7x1x2x3")):
-        of = (lambda x: run(x, values)) if varied is xs else (lambda values: run(0.3, values))
-        expected = jax.jit(jax.vmap(of))(varied)
-        with gpu_twin.in_place_of_a_gpu():
+    cases = [
+        (lambda x: run(x, values), xs, "1x2x3"),
+        (lambda values: run(0.3, values), jnp.outer(xs, values), "7x1x2x3"),
+    ]
+    expected = [jax.jit(jax.vmap(of))(varied) for of, varied, _ in cases]
+    with gpu_twin.in_place_of_a_gpu():
+        for (of, varied, tables), right in zip(cases, expected, strict=True):
             program = jax.jit(jax.vmap(of))
             assert f"(tensor<{tables}xf64>, " in program.lower(varied).as_text()
-            np.testing.assert_array_equal(program(varied), expected)
+            np.testing.assert_array_equal(program(varied), right)
 
 
 def test_no_lanes_are_no_call_that_fails():
@@ -221,18 +224,18 @@ def test_the_record_has_a_slot_for_each_step_and_keeps_to_the_memory_of_the_mode
     )
     tries = int(np.max(found.accepted + found.rejected))
     assert tries > int(np.min(found.accepted + found.rejected))
-    for memory, all_fit in ((10**9, True), (10**6, False)):
-        model = jj.build(SLEIGH, memory=memory)
-        run = jax.jit(jax.vmap(jax.grad(lambda speed, model=model: _end(speed, model)[0])))
-        with gpu_twin.in_place_of_a_gpu():
+    with gpu_twin.in_place_of_a_gpu():
+        for memory, all_fit in ((10**9, True), (10**6, False)):
+            model, gpu_twin.DRIVER.largest = jj.build(SLEIGH, memory=memory), 0
+            run = jax.jit(jax.vmap(jax.grad(lambda speed, model=model: _end(speed, model)[0])))
             said = [
                 *re.findall(r"most_slots = (\d+) : i64, slot = ([1-9]\d*) : i64", run.lower(speeds).as_text())
             ]
             ((most, slot),) = {(int(most), int(slot)) for most, slot in said}
             jax.block_until_ready(run(speeds))
             assert gpu_twin.DRIVER.largest == slot * min(tries, most)
-        assert (tries <= most) == all_fit
-        assert 0.9 * memory < slot * most <= memory
+            assert (tries <= most) == all_fit
+            assert 0.9 * memory < slot * most <= memory
 
 
 def _reason(monkeypatch, uses=(0,), **library) -> str:
@@ -269,15 +272,11 @@ def test_gpus_that_jax_does_not_use_are_left_alone(monkeypatch):
 
 
 def test_a_model_says_on_which_devices_it_is_integrated():
-    for reason, said in (
-        ("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"),
-        ("no driver", "XLA: no driver"),
-    ):
-        with (
-            gpu_twin.in_place_of_a_gpu(),
-            mock.patch.object(nvidia, "reason_against", lambda reason=reason: reason),
-        ):
-            assert said in str(jj.build(jj.models.ChaplyginSleigh()))
+    told = {"": "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)", "no driver": "XLA: no driver"}
+    with gpu_twin.in_place_of_a_gpu():
+        for reason, said in told.items():
+            with mock.patch.object(nvidia, "reason_against", lambda reason=reason: reason):
+                assert said in str(jj.build(jj.models.ChaplyginSleigh()))
 
 
 @pytest.mark.parametrize("sampler", ["random", "latin-hypercube", "sobol", "saltelli"])

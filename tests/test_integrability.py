@@ -19,23 +19,6 @@ FACTS = [
     (models.VerticalDisc(), {"growth_vector": (2, 3, 4)}),
     (models.BallOnTurntable(), {"growth_vector": (3, 5)}),
     (
-        models.TwoWheelAxleFree(),
-        {
-            "growth_vector": (2, 3, 4),
-            "nonholonomic_rows": ("wheel1 slip[0]", "wheel1 slip[1]", "wheel2 slip[0]", "wheel2 slip[1]"),
-            "holonomic_rows_together": 8,  # eight of the ten
-            "cyclic_coordinates": (
-                "x1",
-                "y1",
-                "z1",
-                "x2",
-                "y2",
-                "z2",
-                "psi2",
-            ),  # Wang and Pao (2003), section VI; as free bodies z1 and z2 too
-        },
-    ),
-    (
         models.TwoWheelAxleQuasi(),
         {"growth_vector": (2, 3, 4), "cyclic_coordinates": ("x1", "y1", "x2", "y2", "psi2")},
     ),
