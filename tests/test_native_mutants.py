@@ -542,6 +542,15 @@ MUTANTS = [
     Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
     Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
     Mutant(
+        "dips not looked at",
+        event_search,
+        "may_fall",
+        " & (a + third * slope_a > 0.0) & (b - third * slope_b > 0.0)",
+        "",
+        DIP,
+        "passed over",
+    ),
+    Mutant(
         "a bracket with the wrong end",
         event_search,
         "_follow",
