@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from jourdain_jax.calculus.reals import described
 
-FilePath = str | os.PathLike
+FilePath = str | os.PathLike[str]
 DEEPEST = 250  # tuning: nesting depth of elements: bodies of a chain, in MJCF
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE

@@ -142,7 +142,7 @@ def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
 def fit(
     scene: Scene | BuiltFor,
     data: Data,
-    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable[..., Any] | None] | Iterable[str]" = (),
     *,
     guesses: int = 1,
     shooting: MultipleShooting | None = None,
@@ -221,7 +221,7 @@ def fit(
 def fit_batch(
     scene: Scene | BuiltFor,
     data: Data,
-    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable[..., Any] | None] | Iterable[str]" = (),
     **by_name: Unpack[FitFields],
 ) -> Fit:
     """Return the fits of many repeats of one experiment, computed as one batch.

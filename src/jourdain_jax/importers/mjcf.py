@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.importers.mjcf_elements import TABLE, all_of
 from jourdain_jax.importers.mjcf_geoms import GeomReader, Place, within
@@ -21,7 +22,7 @@ _TYPES = ("free", "ball", "slide", "hinge")
 _ATTITUDE = tuple(f"attitude_{part}" for part in "wxyz")
 
 
-def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> type[Scene]:
+def from_mjcf(path: FilePath, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> type[Scene]:
     """Return a class of scenes from an MJCF file: its bodies, joints, inertias, springs, dampers and motors.
 
         Arm = jj.from_mjcf("arm.xml", ignore=("armature",))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.reals import checked_known
 from jourdain_jax.importers.mjcf_geoms import about
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
@@ -78,7 +79,7 @@ _TABLE = {
 
 
 def from_urdf(
-    path,
+    path: FilePath,
     *,
     base: str = "fixed",
     motors: Iterable[str] = (),

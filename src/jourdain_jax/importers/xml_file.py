@@ -3,6 +3,7 @@ are listed in a warning.
 """
 
 import difflib
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -13,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.files import FilePath, check_depth, number, parsed, read_bytes, shortened
+from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import check_kind
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import warn
@@ -44,7 +45,7 @@ class XmlFile:
         """Read the file at `path`, or the text `path` itself. `table`: the permitted contents of each
         element, the root first. Raises ValueError for an unreadable file and for other contents.
         """
-        check_kind(path, FilePath, "`path`", f"the path of a {format_name} file, or its text")
+        check_kind(path, str | os.PathLike, "`path`", f"the path of a {format_name} file, or its text")
         self.ignore, self.table = as_labels(ignore), table
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
         self.source = f"the {format_name} text" if text is not None else str(path)

@@ -323,7 +323,7 @@ class Visual(eqx.Module):
         return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
     @staticmethod
-    def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
+    def from_file(path: str | os.PathLike[str], *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """Return the mesh in the file `path`, in a format of `trimesh`, such as .stl or .obj.
 
         `scale`: factor, 0.001 for millimetres; `look`: see `Visual`. Raises ImportError without

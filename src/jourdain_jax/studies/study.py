@@ -1,6 +1,5 @@
 """A study: the variation over many motions of one scene, and how they are run."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -8,6 +7,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.calculus.reals import checked_real, checked_whole, described
 from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import MotionFields, Options, as_options
@@ -179,12 +179,12 @@ class Study(Printed):
 
     def run(
         self,
-        path: str | os.PathLike,
+        path: FilePath,
         *,
         chunk: int | None = None,
         progress: bool = True,
         processes: int = 1,
-        client=None,
+        client: Any = None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
         **what: Unpack[TaskFields],

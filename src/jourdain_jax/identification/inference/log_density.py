@@ -11,7 +11,7 @@ Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Unpack
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -256,7 +256,7 @@ _logs = compiled(
 def log_density(
     scene: Scene | BuiltFor,
     data: Data,
-    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable[..., Any] | None] | Iterable[str]" = (),
     *,
     options: Options | None = None,
     **by_name: Unpack[OptionFields],

@@ -9,7 +9,7 @@ R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Unpack
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -113,7 +113,7 @@ def _log_det(F: Matrix, places: Indices) -> Scalar:
 def planned_information(
     scene: Scene | BuiltFor,
     plan: Data,
-    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable[..., Any] | None] | Iterable[str]" = (),
     *,
     options: Options | None = None,
     **by_name: Unpack[OptionFields],

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Array
 
+from jourdain_jax.calculus.files import FilePath
 from jourdain_jax.identification.data.experiment import Data, Experiment
 from jourdain_jax.identification.inference.log_density import log_density
 from jourdain_jax.identification.report.estimates import Estimates
@@ -73,7 +74,7 @@ class Fit(Estimates):
 
     def report(
         self,
-        path: str | os.PathLike,
+        path: FilePath,
         data: Data = (),
         *,
         held_out: Data = (),

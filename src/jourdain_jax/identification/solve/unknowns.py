@@ -129,7 +129,7 @@ class _Entry:
 def unknowns_of(
     scene: Scene,
     runs: Sequence[Experiment],
-    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]",
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable[..., Any] | None] | Iterable[str]",
     apart: bool = False,
 ) -> Unknowns:
     """Return the unknowns named in `free` and in `unknown_start`, sensors and actuators of the runs.
