@@ -78,17 +78,18 @@ class Interval(eqx.Module):
         return (f(self.t0, q0, v) + f(self.t1, q1, v)) / 2
 
 
-def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) -> Scalar:
-    """Return `L_d(q_0, q_1)` in J s."""
-    return over.h * over.mean(lambda t, q, v: lagrangian(scene, t, q, v, inputs(t)), q0, q1)
-
-
 def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
     """Return the momenta of the unconstrained motion: `p^+ = -D_1 L_d - f^-` at the beginning of the interval
     and `p^- = D_2 L_d + f^+` at its end.
     """
-    d0, d1 = jax.grad(lambda q0, q1: discrete_lagrangian(scene, over, q0, q1, inputs), argnums=(0, 1))(q0, q1)
-    if not _has_forces(scene, over.t0, q0):
+
+    def L_d(q0, q1) -> Scalar:  # J s
+        return over.h * over.mean(lambda t, q, v: lagrangian(scene, t, q, v, inputs(t)), q0, q1)
+
+    d0, d1 = jax.grad(L_d, argnums=(0, 1))(q0, q1)
+    # known even while tracing
+    loads = loads_of(scene, motion_at(scene, over.t0, q0, jnp.zeros_like(q0)))
+    if all(load.potential is not None for load in loads):
         return -d0, d1
     v, half = (q1 - q0) / over.h, over.h / 2
     if over.rule == "midpoint":
@@ -106,11 +107,6 @@ def discrete_rows(scene: Scene, over: Interval, q0, q1, inputs: Callable, geomet
     """
     rows = over.mean(lambda t, q, v: velocity_residual(scene, t, q, v, inputs(t)), q0, q1)
     return rows if geometric == 0 else rows.at[:geometric].set(position_residual(scene, over.t1, q1) / over.h)
-
-
-def _has_forces(scene: Scene, t, q) -> bool:
-    """Return whether any load has no potential. The answer is known even while tracing."""
-    return any(load.potential is None for load in loads_of(scene, motion_at(scene, t, q, jnp.zeros_like(q))))
 
 
 def _force(scene: Scene, t, q, u, inputs) -> Speeds:

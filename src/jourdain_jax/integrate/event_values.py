@@ -55,13 +55,14 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -
 
 def first_event(w, before: Values, after: Values):
     """Return the index of the first event within a step: its secant is the first to reach zero."""
-    best, first = None, 0.0
-    for i, (b, a) in enumerate(zip(before, after, strict=True)):
-        share = b / (b - a)
-        share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
-        if best is not None:
-            first = w.where(share < best, i, first)
-        best = share if best is None else w.where(share < best, share, best)
+    shares = [b / (b - a) for b, a in zip(before, after, strict=True)]
+    best, *later = (
+        w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
+        for a, share in zip(after, shares, strict=True)
+    )
+    first = 0.0
+    for i, share in enumerate(later, 1):
+        first, best = w.where(share < best, i, first), w.where(share < best, share, best)
     return first
 
 
@@ -137,15 +138,14 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
     there is no dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B
     m_0)).
     """
-    share = None
+    shares = []
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
         m_0, A, B = cubic(h, a, slope_a, b, slope_b)
         s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
         value = a + s * (m_0 + s * (A + s * B))
         dips = (b > 0.0) & (m_0 < 0.0) & (h * slope_b > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
-        found = w.where(dips, s, 1.0)
-        share = found if share is None else w.smaller(share, found)
-    return share
+        shares.append(w.where(dips, s, 1.0))
+    return reduce(w.smaller, shares)
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):

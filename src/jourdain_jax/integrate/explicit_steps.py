@@ -17,7 +17,7 @@ arrays or writes them as machine code.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -45,7 +45,6 @@ class Method:
     b: np.ndarray
     b_error: np.ndarray
     c: np.ndarray
-    even: ClassVar[bool] = False  # whether steps have equal length
 
     @property
     def needed(self) -> int:

@@ -284,7 +284,6 @@ def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
 _compiled_inputs = for_programs(lambda inputs, t: inputs(t))
 
 
-_NOTHING = object()
 _ZERO = Constant(np.zeros(()))  # shared, because making a module takes some 20 us
 
 
@@ -325,55 +324,41 @@ def as_inputs(scene: Scene, given) -> Inputs:
             f"`inputs` is {described(given)}, expected a dictionary of numbers, functions of time, or"
             " `jj.Sampled` by name"
         )
-    if not given and not scene.modes.pairs:
-        return Inputs((_ZERO,) * len(scene.inputs))
     given = given or {}
     check_names(given, scene.inputs.entries, f"`{type(scene).__name__}` has no input `{{}}`")
     channels: list[Callable] = []
     modes = dict(scene.modes.pairs)
     for name in scene.inputs.entries:
-        value = given.get(name, _NOTHING)
+        value = given.get(name, 0.0)
         advice = "pass a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
         if name in modes:
-            channels.append(
-                Mode(
-                    np.asarray(
-                        scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type()
-                    )
-                )
-            )
+            channels.append(Mode(np.asarray(scene.modes.number(name, value, "`inputs`"), real_type())))
+        elif name not in given:
+            channels.append(_ZERO)
         elif isinstance(value, Sampled):  # checked on construction
             channels.append(value)
         elif callable(value):
             channels.append(_as_channel(value, where))
         else:
-            channels.append(
-                _ZERO
-                if value is _NOTHING
-                else Constant(checked_unless_traced(value, where, (), advice=advice))
-            )
+            channels.append(Constant(checked_unless_traced(value, where, (), advice=advice)))
     return Inputs(tuple(channels))
 
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """Raise ValueError if velocity constraints depend on a mode, or on an input that jumps in the span."""
-    traced = looked_at(scene).traced
-    for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
-        if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
+    traced, modes = looked_at(scene).traced, dict(scene.modes.pairs)
+    known = structure_of(scene).rows_of_inputs and not is_traced(scene, inputs, t0, t1)
+    each = zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True)
+    for name, node, channel in each:
+        changes = known and not isinstance(channel, Constant | Sampled)
+        if not (name in modes or changes) or not any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
+            continue
+        if name in modes:
             raise ValueError(
                 f"constraints of `{type(scene).__name__}` depend on mode `{name}`; only "
                 "loads, potentials and events may depend on modes"
             )
-    if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
-        return
-    for name, node, channel in zip(
-        scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True
-    ):
-        if isinstance(channel, Constant | Sampled) or not any(
-            depend_on(traced.graph, traced.at.phi.tolist(), [node])
-        ):
-            continue
         with jax.ensure_compile_time_eval():  # all values are concrete, even inside `jit`
             values, ts = uncompiled_lanes(channel), np.linspace(float(t0), float(t1), 257)[:, None]
             for _, _, behind in jumps(

@@ -2,11 +2,12 @@
 otherwise in JAX, where batches of a scalar program run in blocks of `width` samples.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,14 +18,12 @@ from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_derivat
 from jourdain_jax.calculus.reals import Indices, is_traced
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays
-from jourdain_jax.integrate.arrays.array_functions import joined
-from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.explicit_steps import Method, method_of
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
 from jourdain_jax.integrate.loop import native_motion
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Start, flow
+from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Found, Start, flow
 from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import driven, may_jump
@@ -68,46 +67,27 @@ class OwnSteps(Integrator):
         )
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        if setup.reason_against_machine_code:
-            run = self._on_arrays
-            pull = self._pulled_on_arrays
-            mover = on_arrays.mover
-            reason = lambda: SECOND_ORDER_MESSAGE
-        else:
-            form = self._form(setup)
-            run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)
-            reason = lambda: reason_against_derivatives(form, 2)
-        rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
-        run = run if self.alongside else with_rules(run, rules)
-        return _on_times(lambda setup, begun: run(*in_sides(setup, begun)), mover, setup, begun)
+        native = not setup.reason_against_machine_code
+        way = self._by_machine_code if native else self._on_arrays
+        mover = partial(native_motion.mover, form=self._form(setup)) if native else on_arrays.mover
 
-    def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
-        """Return the loop in JAX, its arguments, and the number of samples per block (0: no blocks)."""
+        def run(setup: Setup, begun: Begun) -> Solved:
+            form, start, flow, back, reason = way(*in_sides(setup, begun))
+            rules = Rules(pushed_by_jax(flow), partial(_pulled, back), lambda *_: reason())
+            found = (flow if self.alongside else with_rules(flow, rules))(start)
+            return native_motion.solved(form, start.goals, found)
+
+        return _on_times(run, mover, setup, begun)
+
+    def _on_arrays(self, setup: Setup, begun: Begun) -> "_Way":
         program = setup.field.lowered
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
-        return *on_arrays.loop_of(self.solver, setup, begun, self._events(setup)), at_once
+        of, start = on_arrays.loop_of(self.solver, setup, begun, self._events(setup))
 
-    def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
-        of, start, at_once = self._loop(setup, begun)
-        return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
+        def back(asked: Indices, start: Start, found: Found, g: Found) -> tuple:
+            return on_arrays.flow_back(of, at_once, asked, self.memory)(start, g)
 
-    def _pulled_on_arrays(
-        self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved
-    ) -> tuple:
-        """Return the cotangents of varying values from the cotangents `g` of the motion."""
-        setup, begun = arguments
-        of, start, at_once = self._loop(setup, begun)
-        varies = [
-            v
-            for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True)
-            if eqx.is_array(x)
-        ]
-        asked = tuple(i for i, v in enumerate(varies) if v)
-        states = native_motion.cotangents_of_states(g)
-        ends = g.y_end.rows, g.t_end, g.passed.ts[: of.form.transitions]
-        by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, *ends)
-        args = joined(of.rest, [dict(zip(asked, by_known, strict=True)).get(i) for i in range(len(varies))])
-        return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
+        return _Way(of.form, start, on_arrays.flow(of, at_once), back, lambda: SECOND_ORDER_MESSAGE)
 
     def _form(self, setup: Setup) -> Form:
         return native_motion.form_of(setup.field, setup.inputs, **self._events(setup))
@@ -116,53 +96,36 @@ class OwnSteps(Integrator):
         sides = setup.field.lowered.sides if setup.field.lowered else ()
         return {"has_events": bool(self.event_names or sides), "most": self.most, "stopping": self.stopping}
 
-    def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
+    def _by_machine_code(self, setup: Setup, begun: Begun) -> "_Way":
         form, start = self._form(setup), native_motion.start_of(setup, begun)
         assert isinstance(self.solver, Method)
-        return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
-
-    def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Return the cotangents of varying values from the cotangents `g` of the motion."""
-        setup, begun = arguments
-        sampled = [
-            channel
-            for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels)
-            if isinstance(channel, Sampled)
-        ]
-        if any(jax.tree.leaves(sampled)):
-            raise DifferentiationModeError(OF_SAMPLES)
-        asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-        assert isinstance(self.solver, Method)
-        start = native_motion.start_of(setup, begun)
-        by_start, by_known = native_motion.cotangents(
-            self._form(setup), self.solver, start, asked, self.memory, found, g
-        )
-
-        def args(by_args: tuple) -> tuple:
-            field, scene, inputs, fixed, origin = by_args
-            return (
-                field,
-                scene,
-                native_motion.with_known(inputs, by_known[len(fixed) :]),
-                tuple(by_known[: len(fixed)]),
-                origin,
-            )
-
-        return _by_start(perturbed, arguments, by_start, args)
+        back = partial(native_motion.cotangents, form, self.solver, self.memory)
+        run = flow(form, self.solver, self.order)
+        return _Way(form, start, run, back, partial(reason_against_derivatives, form, 2))
 
 
-def _by_start(
-    perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]
-) -> tuple:
-    """Return the cotangents of a setup and its start from those of the initial state and of the rates'
-    arguments.
-    """
-    by_setup, by_begun = jax.tree.map(
-        lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments
-    )
-    return by_setup, eqx.tree_at(
-        lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None
-    )
+class _Way(NamedTuple):
+    """Motion as a function of its start, and its reverse mode."""
+
+    form: Form
+    start: Start
+    flow: Callable[[Start], Found]
+    # (indices of known numbers, start, motion, cotangents of the motion) -> cotangents of the initial state
+    # and of these numbers
+    back: Callable[..., tuple]
+    reason_against_second: Callable[[], str]
+
+
+def _pulled(back: Callable, perturbed: tuple[Start], arguments: tuple[Start], found: Found, g: Found):
+    """Return the cotangents of a start: zero except for its state and its known numbers."""
+    (varies,), (start,) = perturbed, arguments
+    if any(jax.tree.leaves(varies.tables)):
+        raise DifferentiationModeError(OF_SAMPLES)
+    asked = tuple(i for i, is_asked in enumerate(varies.known[0]) if is_asked)
+    by_y, by_known = back(asked, start, found, g)
+    known = dict(zip(asked, by_known, strict=True))
+    zeros = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, varies, start)
+    return (zeros._replace(y=(by_y,), known=(tuple(map(known.get, range(len(start.known[0])))),)),)
 
 
 def own_steps(solver, **static) -> OwnSteps | None:
@@ -289,30 +252,30 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`: relations are
     monitored.
     """
-    traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
+    functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
     if field.lowered is None:
-        functions = [
-            (x.program, numbers_of(y))
-            for x, y in zip(inputs.channels, traced, strict=True)
-            if isinstance(x, FunctionOfTime)
-        ]
-        return loads_may_jump(scene) or any(may_jump(program, varies) for program, varies in functions)
+        return loads_may_jump(scene) or any(may_jump(x.program, _varying(x)) for x in functions)
     program, _ = _relations(field.lowered, inputs, False)
     left_out = [n for n in program.jumps if not watched or n not in program.sided]
     if not left_out:
         return False
-    lowered = [
-        isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels
-    ]
-    numbers = [varies for channel in compress(traced, lowered) for varies in numbers_of(channel)]
-    others = [
-        any(jax.tree.leaves(channel))
-        for channel, is_lowered in zip(traced, lowered, strict=True)
-        if not is_lowered
-    ]
+    merged = program is not field.lowered
+    numbers = [varies for x in functions if merged for varies in _varying(x)]
+    others = _traced(others_of(inputs) if merged else inputs.channels)
     count = len(program.traced.q) + len(program.independent)
     varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
     return any(depend_on(program.graph, left_out, compress(program.variables, varies)))
+
+
+def _varying(channel: FunctionOfTime) -> list[bool]:
+    """Return for each number of a function of time whether it is traced."""
+    shapes = channel.program.shapes
+    parts = _traced([channel.numbers] * (len(shapes) - len(channel.held)) + [*channel.held])
+    return [varies for varies, shape in zip(parts, shapes, strict=True) for _ in range(math.prod(shape))]
+
+
+def _traced(parts: Iterable) -> list[bool]:
+    return [is_traced(x) for x in parts]
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, Indices]:

@@ -11,8 +11,6 @@ def first_sides(w: StepWriter, form: Form, p: Lanes) -> None:
     A number that is zero, or an integer for `floor` and `ceil`, gets the side on which it is after the time
     d = eps^(1/4) span, by the midpoint rule.
     """
-    if not form.sides:
-        return
     fresh, t, first = w.equal(p["accepted"] + p["rejected"], 0.0), p["t"], form.stated
     d = w.eps**0.25 * p["last_goal"]
 

@@ -102,14 +102,6 @@ class Integrator(abc.ABC):
     def solved(self, setup: "Setup", begun: "Begun") -> Solved:
         """Return one motion."""
 
-    def lanes_solved(self, setups: "Setup", begun: "Begun") -> Solved:
-        """Return the motions of a batch; all arrays have a leading batch axis."""
-        # hide the times that all samples share from XLA, which would otherwise propagate them through
-        # diffrax's `nextafter`, one operation per pass
-        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0))
-        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, times)
-        return eqx.filter_vmap(self.solved)(timed, begun)
-
 
 class Times(NamedTuple):
     """Saved times, start and end of a motion, its first and its longest step."""

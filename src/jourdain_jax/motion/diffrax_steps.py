@@ -27,29 +27,19 @@ from jourdain_jax.integrate import event_values, integrands, result_codes
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import shortest
-from jourdain_jax.integrate.inputs import Inputs, as_inputs
+from jourdain_jax.integrate.inputs import as_inputs
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Integrator, Setup, Solved, Times
-from jourdain_jax.integrate.vector_fields.field import Formulation, Instant, Integrated, VectorField
+from jourdain_jax.integrate.vector_fields.field import Formulation, Integrated
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.scene import Scene
 
 
-class _Rates(eqx.Module):
-    """Rates of coordinates and all speeds, in the form of a diffrax vector field."""
-
-    field: VectorField
-    scene: Scene
-    inputs: Inputs
-    fixed: tuple
-
-    def __call__(self, t, y, args) -> tuple:
-        q, u = y
-        found = self.field.rates(
-            Instant(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t))
-        )
-        return found.q, found.v
+def _rates(known: tuple, t, y: tuple, args) -> tuple:
+    """Return the rates of coordinates and all speeds. `known`: arguments as in `integrands.py`."""
+    found = integrands.rates(t, Integrated(y[0], y[1], None), known)
+    return found.q, found.v
 
 
 @shown_from_users_lines
@@ -82,7 +72,7 @@ def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
     model, scene = modelled(scene, Formulation("full")), as_scene(scene)
     inputs = as_inputs(scene, inputs)
     field = model.field(inputs.constant, work=False)
-    return diffrax.ODETerm(_Rates(field, scene, inputs, field.fixed(scene)))
+    return diffrax.ODETerm(eqx.Partial(_rates, (field, scene, inputs, field.fixed(scene), 0.0)))
 
 
 class Diffrax(eqx.Module, Integrator):

@@ -26,7 +26,7 @@ from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
-from jourdain_jax.integrate.vector_fields.field import ByProgram
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant
 from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.motion.drift import (
     MOST_STEP_ERRORS,
@@ -59,7 +59,12 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     """Return the setup in the modes of its contacts, the same setup marked by `_entered`, the zero of these
     marks, and the start.
     """
-    given = _in_contact(_with_machine_code(_prepared(setup)))
+    numbers = {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
+    # derivatives keep the original types
+    given = setup._replace(**in_default_precision(numbers))
+    if isinstance(given.field, ByProgram) and not given.reason_against_machine_code:
+        given = given._replace(field=replace(given.field, native=value_kernels.beside(given.field.program)))
+    given = _in_contact(given)
     timely, (setup, asked) = given.timely, _entered(given)
     if setup.reason_against_machine_code:
         return given, setup.at(setup.times.clipped), asked, _begin(setup, timely)
@@ -76,24 +81,6 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
 _compiled = for_programs(_one_motion, lambda setup: None if setup.reason_against_machine_code else RUN_SELDOM)
 
 
-def _numbers(setup: Setup) -> dict:
-    """Return the numbers with respect to which a motion can be differentiated."""
-    return {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
-
-
-def _prepared(setup: Setup) -> Setup:
-    """Return the setup with all numbers in the default precision. Derivatives keep the original types."""
-    return setup._replace(**in_default_precision(_numbers(setup)))
-
-
-def _with_machine_code(setup: Setup) -> Setup:
-    """Return the setup; if machine code integrates it, machine code also computes values at saved times."""
-    field = setup.field
-    if setup.reason_against_machine_code or not isinstance(field, ByProgram):
-        return setup
-    return setup._replace(field=replace(field, native=value_kernels.beside(field.program)))
-
-
 def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
     """Return the motions of a batch. A scalar program advances `own_steps.width` samples at a time; other
     setups run under `vmap`.
@@ -105,7 +92,10 @@ def integrate_lanes(lane: Callable[..., Setup], varied: tuple) -> Trajectory:
     if jax.default_backend() != "cpu" and not setups.reason_against_machine_code:
         return eqx.filter_vmap(lambda *own: _one_motion(lane(*own)))(*varied)
     given, fitting, asked, begun = eqx.filter_vmap(_started)(setups)
-    solved = setups.integrator.lanes_solved(fitting, begun)
+    # hide the times that all samples share from XLA, which would otherwise propagate them through diffrax's
+    # `nextafter`, one operation per pass
+    times = {name: jax.lax.optimization_barrier(getattr(fitting, name)) for name in ("t0", "t1", "dt0")}
+    solved = eqx.filter_vmap(setups.integrator.solved)(fitting._replace(**times), begun)
     return eqx.filter_vmap(_finish)(given, fitting, asked, begun, solved)
 
 
@@ -186,7 +176,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     def at_state(tau, rows):
         y = begun.y0.with_rows(rows)
         free, y = y, integrands.project(tau, y, args) if puts_back else y
-        _, at = integrands.at_time(tau, y, args)
+        at = Instant(scene, fixed, origin + tau, y, inputs(origin + tau))
         u, pivot = field.speeds_and_pivot(at, plain[3])
         work = y.work
         if stored_first is not None:
@@ -264,11 +254,8 @@ def _phases(
 ) -> Phases:
     """Return the phases of a motion between the events at times `ts` (infinite after the last event)."""
     first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
-    modes = passed.modes if len(passed.modes) == len(first) else np.zeros((len(first), 0))
+    modes = passed.modes if len(ts) else np.zeros((len(first), 0))
     before = jnp.stack(first)[:, None] if first else jnp.zeros((0, 1))
-    if not len(ts):
-        events, lost = jnp.asarray(passed.events), jnp.asarray(passed.lost)
-        return Phases(ts, events, before, lost, names, named)
     there = jnp.isfinite(ts)
     modes = jnp.concatenate([before, jnp.where(there, modes, jnp.nan)], axis=1)
     events, lost = jnp.where(there, passed.events, -1), jnp.where(there, passed.lost, 0.0)

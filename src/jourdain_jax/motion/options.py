@@ -244,18 +244,9 @@ def _check(options: AllOptions) -> None:
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    checked_whole(
-        options.max_steps,
-        "`max_steps`",
-        1,
-        expected="of at least 1; pass the number of steps after which to stop",
-    )
-    checked_whole(
-        options.max_transitions,
-        "`max_transitions`",
-        1,
-        expected="of at least 1; pass the number of events after which to stop",
-    )
+    for name, what in (("max_steps", "steps"), ("max_transitions", "events")):
+        expected = f"of at least 1; pass the number of {what} after which to stop"
+        checked_whole(getattr(options, name), f"`{name}`", 1, expected=expected)
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):

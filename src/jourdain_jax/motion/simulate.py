@@ -208,13 +208,12 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
         asked, advice = (
-            ("backend='native'", "use backend='auto', the fastest possible") if order is None else _BY_SERIES
+            ("backend='native'", "use backend='auto', the fastest possible")
+            if order is None
+            else ("solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8()")
         )
         raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
-
-
-_BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8()"
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
@@ -288,7 +287,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         t0 = as_array(start.t if from_state else 0.0, real_type())
     if t1 is None:
         t1 = as_array(t0 + scene.example_span if ts is None else ts[-1], t0.dtype)
-    ends = known_numbers((t0, t1)).tolist()
+    ends, eps = known_numbers((t0, t1)).tolist(), float(eps_of(t0))
     if ends and not 0 < abs(ends[1] - ends[0]) < np.inf:
         raise ValueError(
             f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; pass a "
@@ -296,17 +295,16 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
         )
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # computed by NumPy if concrete, without compilation
-    elif ends and len(known := known_numbers(ts)) and not _encloses(ends, known):
+    elif (
+        ends
+        and len(known := known_numbers(ts).tolist())
+        and not ends_fit(known[0], known[-1], ends[0], ends[1], eps)
+    ):
         raise ValueError(
             f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = "
             f"{t1} s or in the opposite direction; pass `t0` and `t1` that enclose `ts`"
         )
     return t0, ts, t1
-
-
-def _encloses(ends: list[float], ts: np.ndarray) -> bool:
-    """Return whether the saved times lie between the two ends, in the same direction."""
-    return bool(ends_fit(float(ts[0]), float(ts[-1]), ends[0], ends[1], float(eps_of(ts))))
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":

@@ -205,21 +205,14 @@ class _Record(NamedTuple):
 
 
 def cotangents(
-    of: Loop,
-    asked: Sequence[int],
-    memory: int,
-    start: Start,
-    g_ys: Array,
-    g_end: Array,
-    g_t: Array,
-    g_log: Array,
+    of: Loop, asked: Sequence[int], memory: int, start: Start, g: Found
 ) -> tuple[Array, list[Array]]:
-    """Return the cotangents of the initial state, and of the known arrays with the indices `asked`.
+    """Return the cotangents of the initial state, and of the known arrays with the indices `asked`, from the
+    cotangents `g` of the motion.
 
-    `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and its time, and of
-    the times of transitions. `memory`: limit in bytes; the window and the checkpoints each use at most a
-    quarter.
+    `memory`: limit in bytes; the window and the checkpoints each use at most a quarter.
     """
+    (g_ys,), (g_end,), (g_t,), (g_log,), _ = g
     form, slot = of.form, Slot.of(of.form, of.method)
     begun, fixed = of.begun(start)
     begun, _ = of.saving(start, begun, None)

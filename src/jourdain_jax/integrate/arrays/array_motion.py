@@ -20,6 +20,7 @@ from jourdain_jax.integrate.arrays.array_loop import Loop, cotangents
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.adjoint import moved
+from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.loop_function import Found, Start, differentiated
 from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start
 from jourdain_jax.integrate.setup import Begun, Setup
@@ -62,19 +63,25 @@ def loop_of(
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
     """Return the motion as a function of its start. `at_once`: samples per block; 0: all together."""
-    return differentiated(
-        lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
-    )
+
+    def motion(form: Form) -> Callable[[Start], Found]:
+        run = of._replace(form=form).run
+        return _blocked(run, at_once, run, Found.shared)
+
+    return differentiated(motion, of.form, lambda form, along: None)
 
 
-def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
+def _blocked(run: Callable, at_once: int, lanes_last: Callable, result: Callable) -> Callable:
+    """Return `run`; under `vmap`, it runs `lanes_last` in blocks. `result`: result of `vmap` from the results
+    of all samples and the flags of batched arguments.
+    """
     if not at_once:
-        return of.run
-    motion = jax.custom_batching.custom_vmap(of.run)
+        return run
+    motion = jax.custom_batching.custom_vmap(run)
 
     @motion.def_vmap
-    def motions(count, batched: Sequence, start: Start):
-        return _in_blocks(count, at_once, of.run, batched, start).shared(*batched)
+    def motions(count, batched: Sequence, *given):
+        return result(_in_blocks(count, at_once, lanes_last, batched, *given), *batched)
 
     return motion
 
@@ -84,20 +91,12 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
     (`array_loop.py`).
     """
     back = partial(cotangents, of, asked, memory)
-    if not at_once:
-        return back
-    motion = jax.custom_batching.custom_vmap(back)
 
-    @motion.def_vmap
-    def motions(count, batched: Sequence, *given):
-        def lanes_last(*given):
-            by_y, by_known = back(*given)
-            return by_y, [jnp.moveaxis(x, 0, -1) for x in by_known]
+    def lanes_last(*given):
+        by_y, by_known = back(*given)
+        return by_y, [jnp.moveaxis(x, 0, -1) for x in by_known]
 
-        found = _in_blocks(count, at_once, lanes_last, batched, *given)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return motion
+    return _blocked(back, at_once, lanes_last, lambda found, *_: (found, jax.tree.map(lambda _: True, found)))
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):

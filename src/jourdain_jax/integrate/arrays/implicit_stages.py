@@ -49,7 +49,7 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
     size = w.where(w.differs(fault, RUNNING) & ~aim.locating, math.inf, size)
     accept, next_h = judged(w, w.power, p, aim, size, method.order)
     fails = ~accept if method.even else aim.locating & w.equal(fault, result_codes.UNSOLVED_STEP)
-    return Trial(aim, y1, accept, next_h, smallest if form.pivots else None, fails, fault, method.even)
+    return Trial(aim, y1, accept, next_h, smallest if form.pivots else None, fails, fault)
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:

@@ -52,7 +52,7 @@ from jourdain_jax.integrate.loop.lanes import (
     each_row,
     set_goal,
 )
-from jourdain_jax.integrate.loop.loop import COUNT, TIMES, begin_lane, goal_of, write_functions, write_job
+from jourdain_jax.integrate.loop.loop import TIMES, begin_lane, goal_of, of_job, write_functions, write_job
 from jourdain_jax.integrate.loop.loop_function import MOST_KERNELS, Start, constant_rows, with_tangents
 from jourdain_jax.integrate.loop.rate_functions import write_pulled
 from jourdain_jax.integrate.loop.record import GOALS, TO_STATES, Slot, prepare, write_record
@@ -60,7 +60,7 @@ from jourdain_jax.integrate.loop.samples import pass_knot
 from jourdain_jax.integrate.loop.step import near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.integrate.loop.transitions import write_reset_back
 from jourdain_jax.integrate.loop.value_kernels import called, values_of_nodes
-from jourdain_jax.kernels.ffi import of_lane, write_handler
+from jourdain_jax.kernels.ffi import write_handler
 from jourdain_jax.program.derivative import on_its_own
 
 
@@ -76,7 +76,8 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
     _write_added(w, form)
     if form.projects:
         _write_project_back(w, form)
-    _write_step_back(w, form, method, len(asked))
+    with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
+        step_back(w, form, method, len(asked), state, here, g, by_known)
     if form.has_events:
         write_event_back(w, form, len(asked))
     if form.goes_on:
@@ -147,21 +148,11 @@ def _write_added(w: MachineWriter, form: Form) -> None:
             number, times = w.load(who, lane, "i64"), w.load(job, TIMES, "i64")
             with w.when(number >= 0):
                 a, b = (w.converted("fptosi", w.load(x, lane, "double"), "i64") for x in (firsts, ends))
-                states = of_lane(
-                    w, w.load(job, TO_STATES, "ptr"), w.load(job, COUNT, "i64"), times * count, number
-                )
+                states = of_job(w, job, TO_STATES, times * count, number)
                 with w.counted(b, first=a) as k, w.counted(count) as row:
                     more = w.load(states.place(k * count + row), type="double")
                     place = w.at(g, row * w.lanes + lane, "double")
                     w.store(w.load(place, type="double") + more, place)
-
-
-def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
-    """Write `step_back(state, here, g, by_known)`, which pulls cotangents back through the step in the slot
-    `here`, in lanes that advanced in it.
-    """
-    with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
-        step_back(w, form, method, asked, state, here, g, by_known)
 
 
 def _used(method: Method) -> list[int]:
@@ -275,15 +266,13 @@ def kernel_back(form: Form, method: Method, asked: Indices, memory: int) -> Call
     Its arguments are: samples; the rows of a start; cotangents of the states at the goals, and of the end
     with its time last; the goals; the number of trial steps. Each state is followed by its tangent.
     """
-    count = form.integrated + len(asked)
-    run_rows = called(
+    return called(
         lambda w: write_back(w, form, method, asked, memory),
-        lambda *_: ((count,),),
+        lambda *_: ((form.integrated + len(asked),),),
         arguments_of_samples(form),
         constant=constant_rows(form),
         counted=True,
     )
-    return lambda *arguments: run_rows(*arguments)[0]
 
 
 def flow_back(
@@ -316,7 +305,7 @@ def flow_back(
 
 
 def _pulled(kernel: Callable, start: Start, g, ends, tries) -> Float[Array, "found"]:
-    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals, tries)
+    return kernel(*start.of_samples, (*start.y, *start.numbers()), g, ends, start.goals, tries)[0]
 
 
 Unknowns = Float[Array, "z"]

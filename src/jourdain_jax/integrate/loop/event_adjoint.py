@@ -15,11 +15,10 @@ from jourdain_jax.integrate.event_search import slope_is_flat
 from jourdain_jax.integrate.event_values import chosen
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, Number, StepWriter, copied, each_row
-from jourdain_jax.integrate.loop.loop import COUNT
+from jourdain_jax.integrate.loop.loop import of_job
 from jourdain_jax.integrate.loop.record import TO_ENDS
 from jourdain_jax.integrate.loop.transitions import is_noted, reset_back
-from jourdain_jax.kernels.ffi import OfLane, of_lane, taken_in
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ffi import taken_in
 
 
 def write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
@@ -32,7 +31,7 @@ def write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
             g_t = w.room(1 + len(form.moving))
             with w.each_lane() as lane:
                 number = w.load(who, lane, "i64")
-                end = _cotangents_of_end(w, form, job, w.where(number >= 0, number, 0))
+                end = of_job(w, job, TO_ENDS, form.ends, w.where(number >= 0, number, 0))
                 taken_in(w, 1 + len(form.moving), end.after(form.integrated), g_t, lane)
             event_back(w, form, asked, state, located, g_t, g, by_known)
 
@@ -51,17 +50,12 @@ def write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
                 passed = lanes.of("passed", lane) - 1.0
                 lanes.set("passed", lane, passed)
                 with w.when(passed < float(form.transitions)):
-                    end = _cotangents_of_end(w, form, job, number)
+                    end = of_job(w, job, TO_ENDS, form.ends, number)
                     first = w.converted("fptosi", passed, "i64") + (form.integrated + 1 + len(form.moving))
                     for part in range(1 + len(form.moving)):
                         g_of = w.load(end.place(first + part * form.transitions), type="double")
                         w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))
         reset_back(w, form, asked, state, left, g_t, g, by_known)
-
-
-def _cotangents_of_end(w: MachineWriter, form: Form, job: Value, lane: Value) -> OfLane:
-    """Return the cotangents of the end of a sample and of the times of its transitions."""
-    return of_lane(w, w.load(job, TO_ENDS, "ptr"), w.load(job, COUNT, "i64"), form.ends, lane)
 
 
 def is_located(w: StepWriter, lanes: Lanes) -> Number:

@@ -8,6 +8,7 @@ reached. If inputs are sampled, their tables and knots are the first arguments (
 """
 
 import math
+from contextlib import nullcontext
 
 from jourdain_jax.integrate.event_search import LOCATING, RUNNING
 from jourdain_jax.integrate.explicit_steps import Method, code_at_end
@@ -62,7 +63,9 @@ def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> No
     _write_serve(w, form)
     if isinstance(method, TaylorSteps):
         _write_save_within(w, form, method)
-    _write_loop(w, form, method)
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        _write_lanes(w, form, method, job)
+        w.give(w.null)
     write_handler(
         w,
         2 + arguments_of_samples(form) + w.device,
@@ -96,9 +99,8 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
         w.store(pointer, job, FIRST_ARRAY + word)
-    count = w.room(type="i64")
-    w.store(product(w, results[-1], 1), count)
-    w.store(w.load(count, type="i64"), job, COUNT)
+    count = product(w, results[-1], 1)
+    w.store(count, job, COUNT)
     w.store(last_size(w, times), job, TIMES)
     start_counting(w, job, NEXT)
     if common:
@@ -107,17 +109,11 @@ def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: lis
             w.store(value, job, word)
     if form.sampled:
         store_samples(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
-    share(w, job, w.load(count, type="i64"))
-
-
-def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """Write `loop(job)`, which runs all lanes until no sample is left."""
-    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        _write_lanes(w, form, method, job)
-        w.give(w.null)
+    share(w, job, count)
 
 
 def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
+    """Write code that runs all lanes until no sample is left."""
     # `who`: for each lane the index of its sample, then for each the number of saved times; the number of
     # busy lanes
     state = room_of_lanes(w, form)
@@ -192,14 +188,18 @@ def _starts(w: MachineWriter, form: Form, job: Value, lane: Value) -> list[tuple
 
     On a GPU, numbers that all samples share and no step changes are read in place, so they are omitted.
     """
-    count, known = w.load(job, COUNT, "i64"), form.rows["known"].start
-    own = of_lane(w, w.load(job, STARTS, "ptr"), count, form.given, lane)
+    known, own = form.rows["known"].start, of_job(w, job, STARTS, form.given, lane)
     common = w.load(job, COMMON, "ptr") if w.device else w.null
     return [
         (rows, numbers)
         for rows, is_shared, numbers in sources(w, form.given, own, common, known)
         if not (is_shared and rows.start >= known)
     ]
+
+
+def of_job(w: MachineWriter, job: Value, word: int, numbers: Value | int, lane: Value) -> OfLane:
+    """Return the `numbers` of a sample in the array to which a word of the job points."""
+    return of_lane(w, w.load(job, word, "ptr"), w.load(job, COUNT, "i64"), numbers, lane)
 
 
 def goal_of(w: MachineWriter, job: Value, goals: Value, lane: Value, number: Value | int) -> Value:
@@ -240,9 +240,7 @@ def _write_serve(w: MachineWriter, form: Form) -> None:
                 with w.when(at_knot):
                     pass_knot(w, lanes, lane)
                     set_goal(w, lanes, lane, next_time)
-                with w.when(~at_knot):
-                    _save(w, form, job, who, lanes, lane, runs)
-            else:
+            with w.when(~at_knot) if form.sampled else nullcontext():
                 _save(w, form, job, who, lanes, lane, runs)
 
 
@@ -254,7 +252,7 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
         lanes = Lanes(w, form, state)
         every, flags, y = form.integrated, w.room(), w.room(form.integrated)
         times = w.load(job, TIMES, "i64")
-        goals, states = (w.load(job, word, "ptr") for word in (_GOALS, _STATES))
+        goals = w.load(job, _GOALS, "ptr")
         with w.repeated() as leave:
             goal = lanes["goal"]
             due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
@@ -271,13 +269,8 @@ def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> Non
             with w.each_lane() as lane, w.when(w.load(flags, lane, "double") > 0.0):
                 saved = w.load(who, lane + w.lanes, "i64")
                 number = w.load(who, lane, "i64")
-                handed_out(
-                    w,
-                    every,
-                    y,
-                    lane,
-                    of_lane(w, states, w.load(job, COUNT, "i64"), times * every, number).after(saved * every),
-                )
+                due_now = of_job(w, job, _STATES, times * every, number).after(saved * every)
+                handed_out(w, every, y, lane, due_now)
                 w.store(saved + 1, who, lane + w.lanes)
                 # after the last time no state is due, even if rounding puts an event just beyond that time
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)
@@ -291,14 +284,12 @@ def _save(
     """Save the state of a lane at a due time. When the sample has ended, save its state for all remaining
     times and begin the next sample.
     """
-    times, count, every = w.load(job, TIMES, "i64"), w.load(job, COUNT, "i64"), form.integrated
-    goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
+    times, goals, every = w.load(job, TIMES, "i64"), w.load(job, _GOALS, "ptr"), form.integrated
     number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
+    states = of_job(w, job, _STATES, times * every, number)
     last = w.where(runs, saved + 1, times)
     with w.counted(last, first=saved) as k:
-        handed_out(
-            w, every, lanes.pointer, lane, of_lane(w, states, count, times * every, number).after(k * every)
-        )
+        handed_out(w, every, lanes.pointer, lane, states.after(k * every))
     w.store(last, who, lane + w.lanes)
     with w.when(last < times):
         set_goal(w, lanes, lane, goal_of(w, job, goals, number, last))
@@ -306,7 +297,7 @@ def _save(
         codes = w.room()
         w.store(code_at_end(w, form, lanes), codes)
         lanes.set("code", lane, w.load(codes, lane, "double"))
-        end = of_lane(w, ends, count, form.returned + len(form.log) + 1, number)
+        end = of_job(w, job, _ENDS, form.returned + len(form.log) + 1, number)
         handed_out(w, form.returned, lanes.pointer, lane, end)
         if most := form.transitions:
             noted = w.converted("fptosi", w.smaller(lanes.of("passed", lane), float(most)), "i64")

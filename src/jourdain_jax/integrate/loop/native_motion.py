@@ -7,19 +7,16 @@ numbers in these functions instead of the inputs. `adjoint.py` has the derivativ
     u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import lru_cache
-from itertools import islice
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.markers import entries_of
-from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, Shape, real_type
+from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, real_type
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop import taylor
@@ -36,35 +33,9 @@ from jourdain_jax.program.graph import Unsupported
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
-    """Return all numbers of a function of time as a flat list. If its arrays are replaced by flags or
-    tangents, repeat each of these for each number.
-    """
-    return [
-        x
-        for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True)
-        for x in _each(part, shape)
-    ]
-
-
-def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """Return `channel.numbers` and all of `channel.held` as arrays made of the next `numbers`. An array for
-    which a number is None is None.
-    """
-    found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
-    return [
-        None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape)
-        for each, shape in found
-    ]
-
-
-def _shapes(channel: FunctionOfTime) -> list[Shape]:
-    shapes = channel.program.shapes
-    count = len(shapes) - len(channel.held)
-    return [(count,), *shapes[count:]]
-
-
-def _each(part, shape: Shape) -> list:
-    return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
+    """Return all numbers of a function of time as a flat list."""
+    parts = [jnp.reshape(part, -1) for part in (channel.numbers, *channel.held)]
+    return [x for part in parts if len(part) for x in entries_of(part)]
 
 
 # Limit on the number of operations. Measured compile times: 15,000 operations of a chain of 128 trailers take
@@ -148,31 +119,21 @@ def modes_among(inputs: Inputs) -> Indices:
 
 
 def cotangents(
-    form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, found: Solved, g: Solved
-) -> tuple[Integrated, list]:
-    """Return the cotangents of the start and of each requested known number (`asked`), from the results
-    `found` and their cotangents `g`.
+    form: Form, method: Method, memory: int, asked: Indices, start: Start, found: Found, g: Found
+) -> tuple[Array, tuple[Scalar, ...]]:
+    """Return the cotangents of the initial state and of the known numbers with the indices `asked`, from a
+    motion and its cotangents `g`.
 
     `memory`: limit in bytes for records of steps.
     """
-    which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
-    ends = jnp.concatenate([g.y_end.rows, g.t_end[None], g.passed.ts[: form.transitions]])
-    tries = found.accepted + found.rejected
+    accepted, rejected, _, _, crossings, _, *passed = found.rest[2:9]
+    tries = accepted + rejected
     if form.has_events:  # trial steps that locate an event are not counted; few events need as many as eight
-        tries += 8 * (1 + found.crossings + jnp.isfinite(found.passed.ts).sum())
-    back = flow_back(form, method, which, memory)(
-        start, cotangents_of_states(g), ends, jnp.asarray(tries, real_type())
-    )
-    known = dict(zip(which, entries_of(back[form.y :]), strict=True))
-    return Integrated.of(back[: form.y], form), [known.get(i) for i in range(len(asked))]
-
-
-def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
-    """Return the cotangents of the states at all goals from the cotangents of the results."""
-    states = jax.vmap(lambda y: y.rows)(g.ys)
-    # zero for the last goal, because the end state has its own cotangent
-    return jnp.concatenate([states, jnp.zeros_like(states[:1])])
+        tries += 8 * (1 + crossings + sum(passed))
+    ends = jnp.concatenate([g.end[0], g.t[0][None], g.log[0]])
+    back = flow_back(form, method, asked, memory)(start, g.y[0], ends, tries)
+    return back[: form.y], entries_of(back[form.y :])
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
@@ -182,17 +143,12 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(rates_of_all(form))
 
     def moved_by(y, t, d):
-        known = known_of(args)
-        values, slopes = (
-            zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True)
-            if form.sampled
-            else ((), ())
-        )
-        for i, value in [
-            *zip(form.sampled, values, strict=True),
-            *((i, others[i](t)) for i in form.switched),
-        ]:
-            known[fixed + i] = value
+        known, slopes = known_of(args), []
+        for i in form.sampled:
+            known[fixed + i], slope = jax.jvp(others[i], (t,), (jnp.ones_like(t),))
+            slopes.append(slope)
+        for i in form.switched:
+            known[fixed + i] = others[i](t)
         z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
         return Integrated.of(along_rates(z, d)[: form.y], form)
 
@@ -243,32 +199,6 @@ def known_of(args: tuple) -> list:
         *functions,
         *(channel.value if isinstance(channel, Constant) else None for channel in others_of(inputs)),
     ]
-
-
-def with_known(inputs: Inputs, known: Sequence) -> Inputs:
-    """Return inputs with their numbers replaced by `known`, in the order of `known_of` without the fixed
-    ones.
-    """
-    each = iter(known)
-    new = [
-        x
-        for channel in inputs.channels
-        if isinstance(channel, FunctionOfTime)
-        for x in parts_from(channel, each)
-    ]
-    new += [x for channel, x in zip(others_of(inputs), each, strict=True) if isinstance(channel, Constant)]
-
-    def places(x: Inputs) -> list:
-        both: list[tuple[Any, Callable]] = list(zip(x.channels, inputs.channels, strict=True))
-        functions = [
-            part
-            for channel, own in both
-            if isinstance(own, FunctionOfTime)
-            for part in (channel.numbers, *(channel.held if own.held else ()))
-        ]
-        return [*functions, *(channel.value for channel, own in both if isinstance(own, Constant))]
-
-    return eqx.tree_at(places, inputs, new, is_leaf=lambda x: x is None) if new else inputs
 
 
 def others_of(inputs: Inputs) -> list[Callable]:

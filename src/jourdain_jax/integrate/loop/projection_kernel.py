@@ -336,27 +336,21 @@ def _write_row(w: MachineWriter, of: Rows) -> None:
     first = of.given.index(of.moving[0])
     with w.procedure("row", "state found") as (state, found):
         n = columns if of.metric is not None else 0
-        factors = [w.room(max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows)]
-        _write_putting(w, of, first, state, factors, w.room(columns))
+        sizes = n * n, n, rows * (rows + columns), rows, rows, columns
+        L, c, *factors, x = (w.room(max(count, 1)) for count in sizes)
+        if of.metric is not None:
+            w.run("metric", state, L, c)
+        if of.affine:
+            w.run("factored", state, L, c, *factors)
+            for _ in range(2):
+                w.run("moved", state, L, c, *factors, x)
+                with w.counted(columns) as k:
+                    w.store(w.load(x, k), state, k + first)
+        else:
+            _write_iteration(w, of, first, (state, L, c, *factors, x))
         with w.counted(columns) as k:
             w.store(w.load(state, k + first), found, k)
         w.run("residuals", state, w.at(found, columns))
-
-
-def _write_putting(
-    w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value
-) -> None:
-    """Write code that projects the variables in place."""
-    if of.metric is not None:
-        w.run("metric", state, *factors[:2])
-    if not of.affine:
-        _write_iteration(w, of, first, (state, *factors, x))
-        return
-    w.run("factored", state, *factors)
-    for _ in range(2):
-        w.run("moved", state, *factors, x)
-        with w.counted(len(of.moving)) as k:
-            w.store(w.load(x, k), state, k + first)
 
 
 def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:

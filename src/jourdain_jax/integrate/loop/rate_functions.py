@@ -40,6 +40,16 @@ class Outputs(NamedTuple):
     slopes: NodeList  # time derivatives of sampled inputs
 
 
+def tangents_of(graph: Graph, form: Form) -> tuple[list[NodeList], list[dict[int, int]]]:
+    """Return new input nodes for each tangent: those of coordinates and speeds, and those of known numbers by
+    index.
+    """
+    tangent = lambda k, of: graph.input(f"tangent {k} of {of}", True)
+    every = range(len(form.moving))
+    states = [[tangent(k, f"state {i}") for i in range(form.q_and_v)] for k in every]
+    return states, [{i: tangent(k, f"number {i}") for i in form.moving[k]} for k in every]
+
+
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     """Return nodes, with tangents of the first `pushed` of them."""
     program, count = form.program, len(form.moving)
@@ -47,11 +57,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
         return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
     graph, values, variables = on_its_own(program.graph, nodes, program.variables)
     fixed, t, y, inputs = form.split(variables)
-    states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
-    known = [
-        {i: graph.input(f"tangent {k} of number {i}", True) for i in moving}
-        for k, moving in enumerate(form.moving)
-    ]
+    states, known = tangents_of(graph, form)
     times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
     sampled = {len(y) + len(fixed) + i: n for i, n in zip(form.sampled, slopes, strict=False)}

@@ -16,8 +16,8 @@ from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, copied, each_row, room_of_lanes
-from jourdain_jax.integrate.loop.loop import COUNT, NEXT, RECORD, SLOTS, STARTS, TIMES
-from jourdain_jax.kernels.ffi import handed_out, lanes_taken, next_lane, of_lane, taken_in
+from jourdain_jax.integrate.loop.loop import COUNT, NEXT, RECORD, SLOTS, STARTS, TIMES, of_job
+from jourdain_jax.kernels.ffi import handed_out, lanes_taken, next_lane, taken_in
 from jourdain_jax.kernels.ir_value import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
@@ -55,12 +55,6 @@ class _Rooms(NamedTuple):
     by_known: Value
     tries: Value
 
-    @staticmethod
-    def of(w: MachineWriter, form: Form, asked: int) -> "_Rooms":
-        state, rows = room_of_lanes(w, form), (form.integrated, max(asked, 1))
-        g, by_known = (w.room(count) for count in rows)
-        return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
-
 
 class _Places(NamedTuple):
     """Access to the slots. Functions take the index of a trial step."""
@@ -74,7 +68,9 @@ class _Places(NamedTuple):
 
 def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
     """Write code that runs the forward and backward passes of all lanes until no sample is left."""
-    slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
+    slot, g, by_known = Slot.of(form, method), w.room(form.integrated), w.room(max(asked, 1))
+    who, saved, tries = w.room(w.lanes, "i64"), w.room(), w.room(type="i64")
+    rooms = _Rooms(room_of_lanes(w, form), who, saved, g, by_known, tries)
     lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
     places = _on_gpu(w, slot, job) if w.device else _on_cpu(w, slot, memory)
     with w.repeated() as leave:
@@ -218,13 +214,10 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
     each_row(w, form.integrated, g, lambda i: 0.0)
-    ends = w.load(job, TO_ENDS, "ptr")
     with w.each_lane() as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
-            taken_in(
-                w, form.integrated, of_lane(w, ends, w.load(job, COUNT, "i64"), form.ends, number), g, lane
-            )
+            taken_in(w, form.integrated, of_job(w, job, TO_ENDS, form.ends, number), g, lane)
     # the saved states at unreached times are the last state
     all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
     w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
@@ -251,11 +244,10 @@ def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_
     """Write code that stores the results of a block."""
     g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
-    found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
     with w.each_lane() as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
-            numbers = of_lane(w, found, w.load(job, COUNT, "i64"), each, number)
+            numbers = of_job(w, job, FOUND, form.integrated + asked, number)
             handed_out(w, form.integrated, g, lane, numbers)
             handed_out(w, asked, rooms.by_known, lane, numbers.after(form.integrated))
 

@@ -61,7 +61,6 @@ class Trial(NamedTuple):
     pivot: Number | None  # smallest magnitude of a monitored pivot
     fails: Number | None = None  # whether the step ends the motion with `code`
     code: Number | None = None
-    even: bool = False  # whether the length of steps is fixed
 
 
 def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
@@ -71,7 +70,8 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form, state)
         if isinstance(method, TaylorSteps):
-            first_sides(w, form, lanes)
+            if form.sides:
+                first_sides(w, form, lanes)
             take(
                 w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k)
             )
@@ -81,7 +81,8 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
 
 def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable) -> None:
     """Make one trial step of all running lanes. `tried`: function that returns the `Trial`."""
-    first_sides(w, form, p)
+    if form.sides:
+        first_sides(w, form, p)
     take(w, form, method, p, k, tried(w, form, method, p, k))
 
 

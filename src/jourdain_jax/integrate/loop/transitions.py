@@ -22,9 +22,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.event_values import chosen
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, Number, StepWriter, copied, each_row
-from jourdain_jax.integrate.loop.rate_functions import Outputs, given_values, known_values
+from jourdain_jax.integrate.loop.rate_functions import Outputs, given_values, known_values, tangents_of
 from jourdain_jax.kernels.ir_value import Value
 from jourdain_jax.kernels.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
@@ -80,13 +81,9 @@ def reset_program(form: Form) -> Reset:
     state, modes_after, times = after[: form.q_and_v], after[form.q_and_v : -1], [t]
     # each list is extended below by the tangents, direction by direction
     work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
-    states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
+    states, tangents = tangents_of(graph, form)
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
-    known = [dict(enumerate([*fixed, *inputs]))]
-    known += [
-        {i: graph.input(f"tangent {k} of number {i}", True) for i in moving}
-        for k, moving in enumerate(form.moving)
-    ]
+    known = [dict(enumerate([*fixed, *inputs])), *tangents]
     z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
     # integrated work excludes energy stored in loads, which is added at saved times
     state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]
@@ -328,9 +325,7 @@ def reset_back(
     total = w.load(added, asked)
     for i in range(count):
         total = total + w.load(out, i) * w.load(f, i) - w.load(g, i) * w.load(f_after, i)
-    rate = w.load(rates)
-    for i in range(1, form.events):
-        rate = w.where(w.equal(event, float(i)), w.load(rates, i), rate)
+    rate = chosen(w, event, [w.load(rates, i) for i in range(form.events)])
     by_value = w.where(
         (mark < 0.0) & w.differs(total, 0.0), math.nan, w.where(w.equal(total, 0.0), 0.0, -total / rate)
     )

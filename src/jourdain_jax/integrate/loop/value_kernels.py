@@ -85,15 +85,8 @@ def called(
     def call(lanes: int, threads: int, batch: tuple[int, ...], ranks: tuple[int, ...], arguments: tuple):
         others = len(arguments) - of_samples - 1
         operands = Operands(batch, ranks, of_samples, others, tuple(constant.items()), counted)
-        how = {
-            "handler": handler,
-            "kernel": kernel,
-            "lanes": lanes,
-            "threads": threads,
-            "shapes": shapes,
-            "operands": operands,
-        }
-        return tuple(_call_p.bind(*jax.tree.leaves(arguments), **how))
+        how = handler, kernel, lanes, threads, shapes, operands
+        return tuple(_call_p.bind(*jax.tree.leaves(arguments), **dict(zip(_HOW, how, strict=True))))
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):

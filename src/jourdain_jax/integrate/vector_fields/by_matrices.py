@@ -2,6 +2,8 @@
 without a scalar program, and reductions chosen by the user.
 """
 
+from dataclasses import fields
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -255,22 +257,13 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
     """Return the field with the full state and without projection, for a solver that satisfies the
     constraints by its `own_equations`.
     """
+    kept = {part.name: getattr(field, part.name) for part in fields(VectorField)}
+    kept |= dict.fromkeys(("projects_positions", "projects_speeds", "rows_may_contradict"), False)
     return FullByMatrices(
-        independent=None,
-        reduction=field.reduction,
-        with_work=field.with_work,
-        conserves=field.conserves,
-        projects_positions=False,
-        projects_speeds=False,
-        rows_may_contradict=False,
-        of_inputs=field.of_inputs,
-        event_names=field.event_names,
-        stops=field.stops,
+        **kept | dict.fromkeys(("independent", "cutoff", "undecided")),
         nonlinear_rows=(),
         stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
         usual=usual_lengths(scene),
         inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,
-        cutoff=None,
-        undecided=None,
         own_equations=own_equations,
     )

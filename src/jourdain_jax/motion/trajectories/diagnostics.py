@@ -11,7 +11,7 @@ from jourdain_jax.dynamics.reactions import ContactForce, needs_work
 from jourdain_jax.integrate.inputs import Constant, Mode, Sampled
 from jourdain_jax.integrate.result_codes import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.integrate.vector_fields.field import reason_for_matrices
-from jourdain_jax.motion.trajectories.values_in_time import Checked, Checks, Record, map_with_accelerations
+from jourdain_jax.motion.trajectories.values_in_time import Checked, Record, checked, map_with_accelerations
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.structure.structure import structure_whatever_its_faults, usual_rows
 
@@ -88,7 +88,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
             f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for "
             "a rollout pass one lane: `rollout.lane(0)`"
         )
-    return _diagnosed(trajectory, map_with_accelerations(Checks, trajectory), _lacks_work(trajectory))
+    return _diagnosed(trajectory, map_with_accelerations(checked, trajectory), _lacks_work(trajectory))
 
 
 DRIFTED = 1e-2  # numerics: of the varying energy

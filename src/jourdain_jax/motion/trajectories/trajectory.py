@@ -14,7 +14,7 @@ from jourdain_jax.calculus.figures import MODEL, figure
 from jourdain_jax.calculus.markers import nan_where
 from jourdain_jax.calculus.reals import checked_real
 from jourdain_jax.dynamics.accelerations import Accelerations
-from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
+from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.rows import names_of_bodies
 from jourdain_jax.integrate import result_codes
@@ -39,11 +39,6 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import state_names
 
 
-def sketch(record: Record) -> str:
-    """Draw each coordinate with its name and range, without unreached times."""
-    return _drawn(record, np.asarray(record.ts), np.asarray(record.q)[None])
-
-
 def sketch_of_lanes(record: Record) -> str:
     """Draw a batch of motions: the median, and bands that contain 50 % and 95 % of the samples still running.
     Return "" if samples have different saved times.
@@ -66,8 +61,8 @@ def _spread(count: int, most: int = 120) -> np.ndarray:
 
 
 def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
-    """Draw the coordinates. `levels` (levels, times, coordinates): the middle level is drawn as a line, the
-    others as bands around it.
+    """Draw each coordinate with its name and range, without unreached times. `levels` (levels, times,
+    coordinates): the middle level is drawn as a line, the others as bands around it.
     """
     reached = np.flatnonzero(np.isfinite(levels).all(axis=(0, 2)))
     if reached.size < 2:
@@ -172,20 +167,20 @@ class Trajectory(Record, Printed):
 
     def accelerations(self) -> Accelerations:
         """Return accelerations, multipliers, rank and smallest singular value at all times."""
-        return map_with_accelerations(values_in_time.AccelerationsBySvd, self)
+        return map_with_accelerations(values_in_time.themselves, self)
 
     def constraint_forces(self) -> RowReactions:
         """Return constraint forces per constraint and per body at all times, eqs. (68)-(70).
 
         `.forces_on("disc")` of the result gives the forces on a body by constraint (N, inertial frame).
         """
-        return map_with_accelerations(values_in_time.Reactions, self)
+        return map_with_accelerations(row_reactions, self)
 
     def contact_forces(self) -> dict[str, ContactForce]:
         """Return the normal and tangential force (N) on the body and the friction coefficient needed, for
         each rolling contact at all times.
         """
-        return map_with_accelerations(values_in_time.Contacts, self)
+        return map_with_accelerations(contact_forces, self)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Return residuals of the geometric constraints (and quaternion norms), and of the
@@ -222,7 +217,7 @@ class Trajectory(Record, Printed):
             )
 
     def _picture(self) -> str:
-        return "" if self.q.ndim > 2 else sketch(self)
+        return "" if self.q.ndim > 2 else _drawn(self, np.asarray(self.ts), np.asarray(self.q)[None])
 
     @property
     @of_known_numbers

@@ -1,5 +1,6 @@
 """Compute quantities along a motion: map functions of one state over all saved times."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from jourdain_jax.calculus.reals import (
     static,
 )
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
-from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
+from jourdain_jax.dynamics.reactions import ContactForce, contact_forces
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import NullSpaceSVD
@@ -122,10 +123,10 @@ def first_scene(record: Record) -> Scene:
     return at_index(record.scene, (0,) * (record.q.ndim - 2))
 
 
-def map_with_accelerations(f: type, record: Record):
-    """Evaluate an `OfAccelerations` of class `f` at all times."""
+def map_with_accelerations(f: Callable, record: Record):
+    """Evaluate `f(scene, t, q, u, accelerations, inputs)` at all times, as `map_over_times` does."""
     usual = usual_rows(first_scene(record), varied=record.q.ndim > 2)
-    return map_over_times(f(jax.tree.map(jnp.asarray, usual)), record, by_inputs=True)
+    return map_over_times(_OfAccelerations(f, jax.tree.map(jnp.asarray, usual)), record, by_inputs=True)
 
 
 @with_usual_promotion
@@ -225,35 +226,20 @@ class InputOf(eqx.Module):
         return inputs[scene.inputs.entries.index(self.name)]
 
 
-class OfAccelerations(eqx.Module):
+class _OfAccelerations(eqx.Module):
     """A quantity that depends on accelerations; `usual`: typical constraint rows."""
 
+    f: Callable = static()
     usual: UsualRows
 
-    def accelerations(self, scene, t, q, u, inputs) -> Accelerations:
-        """Return accelerations, multipliers, rank and smallest singular value."""
-        return accelerations(scene, t, q, u, inputs, reduction=NullSpaceSVD(), usual=self.usual)
+    def __call__(self, scene, t, q, u, inputs):
+        found = accelerations(scene, t, q, u, inputs, reduction=NullSpaceSVD(), usual=self.usual)
+        return self.f(scene, t, q, u, found, inputs)
 
 
-class AccelerationsBySvd(OfAccelerations):
-    """Accelerations, multipliers, rank and smallest singular value."""
-
-    def __call__(self, scene, t, q, u, inputs) -> Accelerations:
-        return self.accelerations(scene, t, q, u, inputs)
-
-
-class Reactions(OfAccelerations):
-    """Constraint forces per constraint and per body."""
-
-    def __call__(self, scene, t, q, u, inputs) -> RowReactions:
-        return row_reactions(scene, t, q, u, self.accelerations(scene, t, q, u, inputs), inputs)
-
-
-class Contacts(OfAccelerations):
-    """Normal and tangential force and the friction coefficient needed, for every rolling contact."""
-
-    def __call__(self, scene, t, q, u, inputs) -> dict[str, ContactForce]:
-        return contact_forces(scene, t, q, u, self.accelerations(scene, t, q, u, inputs), inputs)
+def themselves(scene, t, q, u, found: Accelerations, inputs) -> Accelerations:
+    """Return accelerations, multipliers, rank and smallest singular value."""
+    return found
 
 
 def residuals(scene, t, q, u, inputs):
@@ -271,22 +257,14 @@ class Checked(NamedTuple):
 
     energies: tuple[Array, Array]  # kinetic and potential
     residuals: tuple[Array, Array]  # of the geometric and of the velocity constraints
+    invariants: dict[str, Array]
     rank: Array
     smallest_singular_value: Array
-    invariants: dict[str, Array]
     contacts: dict[str, ContactForce]
 
 
-class Checks(OfAccelerations):
-    """`Checked` at one state."""
-
-    def __call__(self, scene, t, q, u, inputs) -> Checked:
-        found = self.accelerations(scene, t, q, u, inputs)
-        return Checked(
-            energies(scene, t, q, u, inputs),
-            residuals(scene, t, q, u, inputs),
-            found.rank,
-            found.smallest_singular_value,
-            invariants(scene, t, q, u, inputs),
-            contact_forces(scene, t, q, u, found, inputs),
-        )
+def checked(scene, t, q, u, found: Accelerations, inputs) -> Checked:
+    """Return diagnostic quantities at one state."""
+    T, g, constant = (f(scene, t, q, u, inputs) for f in (energies, residuals, invariants))
+    forces = contact_forces(scene, t, q, u, found, inputs)
+    return Checked(T, g, constant, found.rank, found.smallest_singular_value, forces)
