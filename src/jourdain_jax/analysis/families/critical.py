@@ -17,6 +17,7 @@ Equations of special points and their derivatives, as one scalar program. Eigenv
 too.
 """
 
+from contextlib import nullcontext
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -31,7 +32,7 @@ from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyE
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, largest, static
+from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, is_traced, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
@@ -114,7 +115,7 @@ class CriticalPoint(Printed, eqx.Module):
     @property
     def speed(self) -> Float[Array, "*batch"]:
         """Return the speed of the point (x, y) of the scene, m/s."""
-        return jnp.hypot(self.state["x_rate"], self.state["y_rate"])
+        return jnp.sqrt(self.state["x_rate"] ** 2 + self.state["y_rate"] ** 2)
 
     @property
     def message(self) -> str:
@@ -216,10 +217,9 @@ class Special(eqx.Module):
 
 
 @compiled_quickly
-def _solution(special: Special, scene: Scene) -> CriticalPoint:
-    """Return the special point of a scene. It is twice differentiable."""
-    X, inverse, condition, code = jax.lax.stop_gradient(followed_to(*jax.lax.stop_gradient((special, scene))))
-    near = X
+def _solution(special: Special, scene: Scene, near: Unknowns, inverse, condition, code) -> CriticalPoint:
+    """Return the special point of a scene from the results of `followed_to`. It is twice differentiable."""
+    X = near
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
     return special.point(scene, X, condition, code)
@@ -253,6 +253,9 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     known = found.found & (largest(change) < 1e-8)
     code = jnp.where(known, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
     return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
+
+
+_found = compiled_quickly(followed_to)
 
 
 def _once(special: Special, scene: Scene, at: _Followed) -> _Followed:
@@ -331,9 +334,13 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
             f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
             f"`{type(scene).__name__}`; pass a scene of the family's class"
         )
+    still = jax.lax.stop_gradient(scene)
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
-    return _solution(special, scene)
+    # outside of transformations, programs compile faster
+    with nullcontext() if is_traced(still) else jax.core.eval_context():
+        found = _found(special, still)
+    return _solution(special, scene, *found)
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:

@@ -210,15 +210,16 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
     """Return the same function as `nodes_called`, with derivatives. Nodes that are structurally zero cost
     nothing.
     """
-    graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
+    own = cache(lambda: on_its_own(graph, nodes, variables))  # derivatives add nodes to it
 
     @cache
     def derivative(back: bool, order: int) -> Callable[..., Array] | None:
         """Return the derivative as a function of the parts of x, v or g, and w; None if it is too large or
         cannot be compiled to machine code.
         """
+        graph, nodes, variables = own()
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
 
