@@ -17,7 +17,6 @@ Equations of special points and their derivatives, as one scalar program. Eigenv
 too.
 """
 
-from contextlib import nullcontext
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -32,7 +31,7 @@ from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyE
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, is_traced, largest, static
+from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
@@ -255,7 +254,9 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
 
 
-_found = compiled_quickly(followed_to)
+# a rule that is never needed: without derivatives, JAX computes at once, by a program that compiles quickly
+_found = jax.custom_jvp(compiled_quickly(followed_to))
+_found.defjvp(lambda *_: NotImplemented)
 
 
 def _once(special: Special, scene: Scene, at: _Followed) -> _Followed:
@@ -334,13 +335,9 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
             f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a "
             f"`{type(scene).__name__}`; pass a scene of the family's class"
         )
-    still = jax.lax.stop_gradient(scene)
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
-    # outside of transformations, programs compile faster
-    with nullcontext() if is_traced(still) else jax.core.eval_context():
-        found = _found(special, still)
-    return _solution(special, scene, *found)
+    return _solution(special, scene, *_found(special, jax.lax.stop_gradient(scene)))
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
