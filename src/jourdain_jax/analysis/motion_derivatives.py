@@ -169,30 +169,22 @@ class ByMatrices:
 
     constant: Indices
 
+    @compiled_quickly
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
         """Return v, D and the mass matrix of a scene at an instant."""
-        return _by_matrices(scene, self.constant, t, q, u, f)
+        at = places_of(scene)
 
+        def instant(x):
+            t, q, u, f = x[at.t[0]], x[at.q], x[at.u], x[at.f]
+            equations, rows = equations_and_rows(scene, t, q, u, f)
+            problem = scaled(equations, rows.judged_by(usual_rows(scene)))
+            udot = problem.c * Privileged(self.constant).solve(problem)[0]
+            v = [coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]
+            return jnp.concatenate(v), equations.M
 
-@compiled_quickly
-def _by_matrices(scene: Scene, constant: Indices, t, q, u, f):
-    at = places_of(scene)
-
-    def instant(x):
-        t, q, u, f = x[at.t[0]], x[at.q], x[at.u], x[at.f]
-        equations, rows = equations_and_rows(scene, t, q, u, f)
-        problem = scaled(equations, rows.judged_by(usual_rows(scene)))
-        udot = problem.c * Privileged(constant).solve(problem)[0]
-        return (
-            jnp.concatenate(
-                [coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]
-            ),
-            equations.M,
-        )
-
-    x = jnp.concatenate([t[None], q, u, f])
-    v, slope, M = jax.linearize(instant, x, has_aux=True)
-    return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
+        x = jnp.concatenate([t[None], q, u, f])
+        v, slope, M = jax.linearize(instant, x, has_aux=True)
+        return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
 
 
 def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False) -> "ByProgram | ByMatrices":

@@ -2,46 +2,51 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from importlib import import_module
 
+from jourdain_jax import models
 from jourdain_jax.scene.coordinates import Labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
-PLACES = {  # module -> names of its models; modules are imported on first use
-    "two_wheel_axle": (
-        "two-wheel-axle-free",
-        "two-wheel-axle-coordinates",
-        "two-wheel-axle-quasi",
-        "two-wheel-axle-redundant",
-    ),
-    "blades": ("skate", "chaplygin-sleigh", "snakeboard", "trailer-chain"),
-    "discs": ("vertical-disc", "tilting-disc", "tilting-disc-quaternion"),
-    "particles": ("rosenberg-particle", "heisenberg-particle", "isokinetic-particle"),
-    "rolling_solids": ("ball-on-turntable", "rattleback"),
-    "turning_bodies": ("suslov", "free-rigid-body"),
-    "whipple_bicycle": ("whipple-bicycle",),
-    "pendulums": ("double-pendulum-rods", "double-pendulum-angles", "spring-and-rod", "pendulum-chain"),
-}
-CLASSES = {
-    "".join(map(str.capitalize, name.split("-"))): module
-    for module, names in PLACES.items()
-    for name in names
-}
-_CLASS_OF = dict(zip((name for names in PLACES.values() for name in names), CLASSES, strict=True))
+NAMES = (
+    "two-wheel-axle-free",
+    "two-wheel-axle-coordinates",
+    "two-wheel-axle-quasi",
+    "two-wheel-axle-redundant",
+    "skate",
+    "chaplygin-sleigh",
+    "snakeboard",
+    "trailer-chain",
+    "vertical-disc",
+    "tilting-disc",
+    "tilting-disc-quaternion",
+    "rosenberg-particle",
+    "heisenberg-particle",
+    "isokinetic-particle",
+    "ball-on-turntable",
+    "rattleback",
+    "suslov",
+    "free-rigid-body",
+    "whipple-bicycle",
+    "double-pendulum-rods",
+    "double-pendulum-angles",
+    "spring-and-rod",
+    "pendulum-chain",
+)
 
 
 class _Models(Mapping[str, type[Scene]]):
     """A read-only mapping from the names of models to their classes."""
 
     def __getitem__(self, name: str) -> type[Scene]:
-        kind = _CLASS_OF[name]
-        return getattr(import_module(f"{__package__}.{CLASSES[kind]}"), kind)
+        if name not in NAMES:
+            raise KeyError(name)
+        return getattr(models, "".join(map(str.capitalize, name.split("-"))))  # imported on first use
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_CLASS_OF)
+        return iter(NAMES)
 
     def __len__(self) -> int:
-        return len(_CLASS_OF)
+        return len(NAMES)
 
 
 MODELS = _Models()

@@ -10,8 +10,7 @@ Each of these expressions is separate machine code, compiled when it is needed; 
 the graph. If a program is too large, JAX differentiates the program as run by XLA.
 
 Quantities outside the steps are numbers that depend only on parameters, and all speeds, pivots and energies
-at saved states. Machine code avoids XLA's tracing and compilation. Only if speeds have few operations, XLA
-computes their derivatives (`lowering/lowered_equations.py`).
+at saved states. XLA differentiates speeds with few operations (`lowering/lowered_equations.py`).
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
