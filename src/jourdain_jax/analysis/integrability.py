@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import largest, real_type
-from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.sampling import sample_states
@@ -45,20 +45,16 @@ class RowsOverStates:
     def __init__(self, scene: Scene):
         self.scene, self.traced = scene, traced_scene(scene)
         g, at, u = self.traced.graph, self.traced.at, self.traced.u.tolist()
-        flat = [*at.phi.tolist(), *at.qdot.tolist()]
-        slopes = jacobian(g, flat, u)
-        self.shape = len(flat), len(u)
-        self.places = [(i, u.index(n)) for i, row in enumerate(slopes) for n in row]
-        self.values = [
-            *flat,
-            *g.substituted(at.qdot.tolist(), dict.fromkeys(u, g.zero)),
-            *(node for row in slopes for node in row.values()),
-        ]
-        variables = [self.traced.t, *self.traced.q.tolist()]
-        changes = jacobian(g, self.values, variables)
-        self.changes = [
-            (i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()
-        ]
+        qdot, variables = at.qdot.tolist(), [self.traced.t, *self.traced.q.tolist()]
+        flat = [*at.phi.tolist(), *qdot]
+        slopes = np.full((len(flat), len(u)), g.zero)
+        for row, of in zip(slopes, jacobian(g, flat, u), strict=True):
+            row[[u.index(n) for n in of]] = [*of.values()]
+        self.shape, still = slopes.shape, g.substituted(qdot, dict.fromkeys(u, g.zero))
+        self.values = [*flat, *still, *slopes.ravel().tolist()]
+        self.moved = [f"rate {k}" for k in range(len(variables))]
+        rates = [g.input(name, True) for name in self.moved]
+        self.changes = derivatives(g, self.values, dict(zip(variables, rates, strict=True)))
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
         """Return the rows (d, A) and the frame (1, 0; nu, N) at points, and a function that returns their
@@ -66,33 +62,25 @@ class RowsOverStates:
 
         `x`, `u` and the directions have a leading axis of points.
         """
-        probes = Probes(
-            self.traced.graph,
-            named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs)))),
-        )
-        found = probes([*self.values, *(node for _, _, node in self.changes)])
-        value, change = found[: len(self.values)], found[len(self.values) :]
-        place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))
+        inputs = np.zeros((len(x), len(self.scene.inputs)))
+        probes = Probes(self.traced.graph, named_values(self.scene, x[:, 0], x[:, 1:], u, inputs))
 
         def along(direction: np.ndarray) -> Both:
-            rate = np.zeros_like(value)
-            np.add.at(rate, place, change * direction.T[variable])
-            return self._arranged(rate, u, 0.0)
+            moving = probes.with_inputs(dict(zip(self.moved, direction.T, strict=True)))
+            return self._arranged(moving(self.changes), u, 0.0)
 
-        return self._arranged(value, u, 1.0), along
+        return self._arranged(probes(self.values), u, 1.0), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
         """Return the rows and the frame as arrays with a leading axis of points. `time`: the rate of the time
         coordinate.
         """
         count, rows = self.shape[0], len(self.traced.at.phi)
-        slopes = np.zeros((flat.shape[-1], *self.shape))
-        if self.places:
-            i, j = zip(*self.places, strict=True)
-            slopes[:, i, j] = flat[count + len(self.traced.q) :].T
+        value, still, slopes = np.split(flat.T, [count, 2 * count - rows], axis=1)
+        slopes = slopes.reshape(-1, *self.shape)
         A, F = slopes[:, :rows], np.pad(slopes[:, rows:], ((0, 0), (1, 0), (1, 0)))
-        F[:, 0, 0], F[:, 1:, 0] = time, flat[count : count + len(self.traced.q)].T
-        d = flat[:rows].T - np.einsum("pij,pj->pi", A, u)
+        F[:, 0, 0], F[:, 1:, 0] = time, still
+        d = value[:, :rows] - np.einsum("pij,pj->pi", A, u)
         return np.concatenate([d[..., None], A], axis=-1), F
 
 
