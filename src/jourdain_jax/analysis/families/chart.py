@@ -102,9 +102,7 @@ def stability_chart(
             for x in values:  # one point compiles faster than a batch
                 point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
                 by_all = (
-                    np.asarray(special.program.pulled(numbers, inverse[k]))
-                    if given
-                    else np.full(len(numbers), np.nan)
+                    special.pulled(numbers, np.asarray(inverse[k])) if given else np.full(len(sigma), np.nan)
                 )
                 curve.append((point, np.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]))
             found, band = jax.tree.map(lambda *x: np.stack(x), *curve)
@@ -120,4 +118,4 @@ def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple
     """
     scene = scene.replace(**{first: x})
     X, inverse, *found = followed_to(special, scene)
-    return special.point(scene, X, *found), special.given(special.numbers(scene, X), X), inverse
+    return special.point(scene, X, *found), special.arguments(scene, X), inverse

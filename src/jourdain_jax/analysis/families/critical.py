@@ -41,35 +41,23 @@ from jourdain_jax.scene.scene import Scene
 
 
 class SpecialProgram:
-    """Program for R, the residual of `F (a b) = (a b) S`, C a and C b, and their derivatives. Arguments are
-    all numbers, a, b, and S by rows.
+    """Program for R, F x and C x of one vector x, and their derivatives. Arguments are all numbers and x; the
+    vectors a and b are a batch.
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
         graph, (rows, rates, states, of_states, places) = instant.graph, of
-        x, m = [instant.columns[k] for k in states], len(states)
-        given = [graph.input(f"special {k}", True) for k in range(2 * m + 4)]
-        a, b, S = given[:m], given[m:-4], given[-4:]
-        moved, nodes, beside = [instant.v[k] for k in (*rates, *of_states)], [instant.v[k] for k in rows], []
-        for direction, p, q in ((a, S[0], S[2]), (b, S[1], S[3])):
-            found = derivatives(graph, moved, dict(zip(x, direction, strict=True)))
-            nodes += [
-                graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d)))
-                for f, c, d in zip(found, a, b, strict=False)
-            ]
-            beside += found[m:]
-        nodes, variables = [*nodes, *beside], [*instant.given, *given]
-        self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
-        self.values, self.rows = differentiable(graph, nodes, variables), len(nodes)
-        self.pulled = jax.jit(
-            lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows))[: self.rows])[0]
-        )
+        x = [graph.input(f"special {k}", True) for k in range(len(states))]
+        moved, at = [instant.v[k] for k in (*rates, *of_states)], [instant.columns[k] for k in states]
+        nodes = [instant.v[k] for k in rows] + derivatives(graph, moved, dict(zip(at, x, strict=True)))
+        variables, self.rows = [*instant.given, *x], len(nodes)
+        self._sloped = graph, nodes, [*(instant.given[k] for k in places), *x], variables, instant.guards
+        self.values = differentiable(graph, nodes, variables)
+        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows - len(w))))[0])
 
     @cached_property
     def of(self) -> Sloped:
-        """Return the function that computes the equations and their derivatives with respect to z, a, b and
-        S.
-        """
+        """Return the function that computes R, F x, C x and their derivatives with respect to z and x."""
         return Sloped(*self._sloped)
 
 
@@ -158,11 +146,10 @@ class Special(eqx.Module):
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
-    def given(self, numbers: Float[Array, "numbers"], X: Unknowns) -> Float[Array, "all_numbers"]:
-        """Return the arguments of the program: all numbers, a, b, and S(w) by rows."""
-        _, a, b, w = self.parts(X)
-        of_w, fixed = np.array(SHAPES[self.kind])
-        return jnp.concatenate([numbers, a, b, of_w * w + fixed])
+    def arguments(self, scene: Scene, X: Unknowns) -> Float[Array, "2 all_numbers"]:
+        """Return the arguments of the program for a and for b."""
+        numbers = self.numbers(scene, X)
+        return jnp.stack([jnp.append(numbers, x) for x in self.parts(X)[1:3]])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
         """Return L and c of the linear equations `L X = c`. They fix the held values, the size and phase of a
@@ -180,18 +167,37 @@ class Special(eqx.Module):
         L = jnp.concatenate([of_z, jnp.pad(jnp.concatenate([a, b], axis=1), ((0, 0), (len(z), 1))), of_w])
         return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
 
+    def rows(self, X: Unknowns, values: Float[Array, "2 values"], near: Unknowns) -> Array:
+        """Return the residual G of the equations. `values`: results of the program for a and for b."""
+        (_, a, b, w), (of_w, fixed) = self.parts(X), np.reshape(SHAPES[self.kind], (2, 2, 2))
+        count = len(self.equations.rows)
+        R, Fx, Cx = jnp.split(values, [count, count + len(self.equations.states)], axis=1)
+        left, (L, c) = Fx - (of_w * w + fixed).T @ jnp.stack([a, b]), self.linear(near)
+        return jnp.concatenate([R[0], jnp.ravel(left), jnp.ravel(Cx), L @ X - c])
+
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
         """Return the residual G of the equations."""
-        L, c = self.linear(near)
-        return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
+        return self.rows(X, jax.vmap(self.program.values)(self.arguments(scene, X)), near)
 
     def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
         """Return the Jacobian and the residual, (G_X, G), as one matrix."""
-        (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
-        G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
-        size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])
-        rows = jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w, G])
-        return jnp.concatenate([rows, jnp.column_stack([L, L @ X - c])])
+        values, D, _ = jax.vmap(self.program.of)(self.arguments(scene, X))
+        of_z, of_x = jnp.split(D, [len(self.equations.places)], axis=2)
+
+        def along(dX):
+            dz, da, db, _ = self.parts(dX)
+            moved = of_z @ (dz * self.equations.size) + jnp.einsum("kij,kj->ki", of_x, jnp.stack([da, db]))
+            return jax.jvp(lambda *at: self.rows(*at, near), (X, values), (dX, moved))
+
+        G, J = jax.vmap(along, out_axes=(None, 1))(jnp.eye(len(X)))
+        return jnp.column_stack([J, G])
+
+    def pulled(self, arguments: Float[Array, "2 all_numbers"], weights: np.ndarray) -> np.ndarray:
+        """Return the derivatives of `weights . G` with respect to all numbers."""
+        count, m = len(self.equations.rows), len(self.equations.states)
+        R, Fx, Cx = np.split(weights[: 2 * self.program.rows - count], [count, count + 2 * m])
+        parts = zip(arguments, (R, 0 * R), Fx.reshape(2, -1), Cx.reshape(2, -1), strict=True)
+        return sum(np.asarray(self.program.pulled(x, np.concatenate(of))) for x, *of in parts)
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
         """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""

@@ -76,18 +76,18 @@ def sensitivities(
     single = condition > 1e-6 and np.partition(np.append(apart, np.inf), 1)[1] > SURE * (1 + abs(s))
     y = y / (y @ x)
 
-    program = program_of(equations)
-    X, zero = np.concatenate([equations.at(z), x.real, x.imag, np.zeros(4)]), np.zeros(len(look.R), complex)
+    program, numbers, zero = program_of(equations), equations.at(z), np.zeros(len(look.R), complex)
 
-    def pulled(of_rows, of_rates):
+    def pulled(x, of_rows, of_rates):
         """Return derivatives of `of_rows . R + of_rates . F x` with respect to all numbers."""
-        weights = np.concatenate([of_rows, of_rates, 1j * of_rates])
-        real, imag = (np.asarray(program.pulled(X, part)) for part in (weights.real, weights.imag))
-        return (real + 1j * imag)[: len(equations.given)]
+        at, weights = np.concatenate([numbers, x]), np.concatenate([of_rows, of_rates])
+        real, imag = (np.asarray(program.pulled(at, part)) for part in (weights.real, weights.imag))
+        return (real + 1j * imag)[: len(numbers)]
 
-    by_all = pulled(zero, y)
+    by_all = pulled(x.real, zero, y) + 1j * pulled(x.imag, zero, y)
     inverse = np.linalg.pinv(np.vstack([look.J, np.eye(len(z))[fixed]]), rcond=1e-9)
-    by_all = by_all + pulled(-(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)], 0 * y)
+    by_motion = -(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)]
+    by_all = by_all + pulled(x.real, by_motion, 0 * y)
     if not single:
         by_all = by_all * np.nan
     at = numbered(scene)

@@ -234,8 +234,8 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
             )
         except Unsupported:
             return None
-        # limit on operations; machine code of this size takes 1.4 MB of stack and 0.3 s to compile
-        if unsupported(graph, found) or graph.operations(found) > 40_000:
+        # limit on operations; machine code of this size takes 2.4 MB of stack and 1 s to compile
+        if unsupported(graph, found) or graph.operations(found) > 70_000:
             return None
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
