@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.families.critical import CriticalPoint, Special, followed_to, special_at
-from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
+from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations
 from jourdain_jax.analysis.families.family import Family, family
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Number, Scalar
@@ -81,30 +82,24 @@ def stability_chart(
     # creating a scene with each end value checks that the value is valid
     scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
-    known, place, given = middle.equations, numbered(scene), dict(prior or {})
+    known, given = middle.equations, dict(prior or {})
     assert isinstance(known, SteadyEquations)
     check_names(
-        given, vars(place), f"`prior` names `{{}}`, which is not a parameter of `{type(scene).__name__}`"
+        given, vars(scene), f"`prior` names `{{}}`, which is not a parameter of `{type(scene).__name__}`"
     )
-    sigma, k = np.zeros(len(known.given)), known.index(second)
     try:
-        sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
-    except (AttributeError, TypeError):
+        sigma = {name: np.asarray(one.sigma) for name, one in given.items() if name != first}
+    except AttributeError:
         raise ValueError(
             f"`prior` is {given}, expected a dictionary of `jj.studies.Normal(mean, sigma)` by the "
             "names of scalar parameters"
         ) from None
-    sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []
     for change in middle.changes:
         if change.kind != DOUBLE:
-            special, curve = special_at(known, change), []
-            for x in values:  # one point compiles faster than a batch
-                point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
-                by_all = (
-                    special.pulled(numbers, np.asarray(inverse[k])) if given else np.full(len(sigma), np.nan)
-                )
-                curve.append((point, np.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]))
+            special, k = special_at(known, change), known.index(second)
+            # one point compiles faster than a batch
+            curve = [_followed_to(special, scene, first, np.asarray(x), k, sigma) for x in values]
             found, band = jax.tree.map(lambda *x: np.stack(x), *curve)
             boundaries.append((change.modes[0], found))
             bands.append(band)
@@ -112,10 +107,16 @@ def stability_chart(
 
 
 @compiled_quickly
-def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
-    """Return the critical point for the value `x` of the first axis, the arguments of the program there, and
-    the pseudo-inverse of the equations' Jacobian.
+def _followed_to(
+    special: Special, scene: Scene, first: str, x: Scalar, k: int, sigma: dict[str, Array]
+) -> tuple[CriticalPoint, Scalar]:
+    """Return the critical point for the value `x` of the first axis, and the standard deviation of the
+    unknown k due to those of the parameters.
     """
     scene = scene.replace(**{first: x})
     X, inverse, *found = followed_to(special, scene)
-    return special.point(scene, X, *found), special.arguments(scene, X), inverse
+    band = jnp.array(jnp.nan)
+    if sigma:
+        (by,) = jax.vjp(lambda scene: special.equations_at(scene, X, X), scene)[1](inverse[k])
+        band = jnp.linalg.norm(jnp.stack([getattr(by, name) * s for name, s in sigma.items()]))
+    return special.point(scene, X, *found), band * special.equations.size[k]

@@ -17,6 +17,7 @@ Equations of special points and their derivatives, as one scalar program. Eigenv
 too.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -140,16 +141,16 @@ class Special(eqx.Module):
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
+    def places(self, X: Unknowns) -> Float[Array, "2 places"]:
+        """Return the unknowns among the arguments of the program, in SI units, for a and for b."""
+        z, a, b, _ = self.parts(X)
+        return jnp.stack([jnp.append(z * self.equations.size, x) for x in (a, b)])
+
     def normal(self, X: Unknowns) -> Unknowns:
         """Return X scaled to unit length of a, or of a + i b for a pair."""
         z, a, b, w = self.parts(X)
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
-
-    def arguments(self, scene: Scene, X: Unknowns) -> Float[Array, "2 all_numbers"]:
-        """Return the arguments of the program for a and for b."""
-        numbers = self.numbers(scene, X)
-        return jnp.stack([jnp.append(numbers, x) for x in self.parts(X)[1:3]])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
         """Return L and c of the linear equations `L X = c`. They fix the held values, the size and phase of a
@@ -177,27 +178,23 @@ class Special(eqx.Module):
 
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
         """Return the residual G of the equations."""
-        return self.rows(X, jax.vmap(self.program.values)(self.arguments(scene, X)), near)
+        return self.rows(X, self.each(self.program.values, scene, X), near)
+
+    def each(self, function: Callable, scene: Scene, X: Unknowns):
+        """Return results of a function of all arguments of the program, for a and for b."""
+        numbers = self.numbers(scene, X)
+        return jax.vmap(lambda x: function(jnp.append(numbers, x)))(jnp.stack(self.parts(X)[1:3]))
 
     def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
         """Return the Jacobian and the residual, (G_X, G), as one matrix."""
-        values, D, _ = jax.vmap(self.program.of)(self.arguments(scene, X))
-        of_z, of_x = jnp.split(D, [len(self.equations.places)], axis=2)
+        values, D, _ = self.each(self.program.of, scene, X)
 
         def along(dX):
-            dz, da, db, _ = self.parts(dX)
-            moved = of_z @ (dz * self.equations.size) + jnp.einsum("kij,kj->ki", of_x, jnp.stack([da, db]))
-            return jax.jvp(lambda *at: self.rows(*at, near), (X, values), (dX, moved))
+            change = dX, jnp.einsum("kij,kj->ki", D, self.places(dX))
+            return jax.jvp(lambda *at: self.rows(*at, near), (X, values), change)
 
         G, J = jax.vmap(along, out_axes=(None, 1))(jnp.eye(len(X)))
         return jnp.column_stack([J, G])
-
-    def pulled(self, arguments: Float[Array, "2 all_numbers"], weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives of `weights . G` with respect to all numbers."""
-        count, m = len(self.equations.rows), len(self.equations.states)
-        R, Fx, Cx = np.split(weights[: 2 * self.program.rows - count], [count, count + 2 * m])
-        parts = zip(arguments, (R, 0 * R), Fx.reshape(2, -1), Cx.reshape(2, -1), strict=True)
-        return sum(np.asarray(self.program.pulled(x, np.concatenate(of))) for x, *of in parts)
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
         """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""
