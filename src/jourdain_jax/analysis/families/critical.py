@@ -370,6 +370,7 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     F, C = look.small
     E = null_space(C)
     A, w, b = E.T @ F @ E, 0.0, np.zeros(len(E))
+    null = lambda M: np.linalg.svd(M)[2][-1].conj()
     freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
@@ -378,15 +379,15 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
                 "`critical` follows a zero eigenvalue only on a curve; choose a point of another kind"
             )
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
-        a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
+        a = E @ null(np.vstack([A, b @ E]))
     elif point.kind == PAIR:
         w = min((x for x in s if x.imag > 0), key=lambda x: abs(x.real)).imag
-        x = E @ np.linalg.svd(A - 1j * w * np.eye(len(A)))[2][-1].conj()
+        x = E @ null(A - 1j * w * np.eye(len(A)))
         a, b = x.real, x.imag
     else:
         w = np.mean(min(combinations(s, 2), key=lambda pair: abs(pair[0] - pair[1]))).real
         moved = A - w * np.eye(len(A))
-        a = np.linalg.svd(moved)[2][-1]
+        a = null(moved)
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
     return Special(equations, program_of(equations), point.kind, X)

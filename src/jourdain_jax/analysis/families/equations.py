@@ -141,13 +141,8 @@ class Motions(ABC):
 
     def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
         """Return the equations, with an additional row for each unknown that keeps its value."""
-        if not len(self.held):
-            return Look(R, J * self.size, small)
-        return Look(
-            np.append(R, (z - self.start)[self.held]),
-            np.vstack([J * self.size, np.eye(len(z))[self.held]]),
-            small,
-        )
+        rows = np.eye(len(z))[self.held]
+        return Look(np.append(R, rows @ (z - self.start)), np.vstack([J * self.size, rows]), small)
 
 
 class SteadyEquations(Motions):
