@@ -141,11 +141,6 @@ class Special(eqx.Module):
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
-    def places(self, X: Unknowns) -> Float[Array, "2 places"]:
-        """Return the unknowns among the arguments of the program, in SI units, for a and for b."""
-        z, a, b, _ = self.parts(X)
-        return jnp.stack([jnp.append(z * self.equations.size, x) for x in (a, b)])
-
     def normal(self, X: Unknowns) -> Unknowns:
         """Return X scaled to unit length of a, or of a + i b for a pair."""
         z, a, b, w = self.parts(X)
@@ -168,17 +163,22 @@ class Special(eqx.Module):
         L = jnp.concatenate([of_z, jnp.pad(jnp.concatenate([a, b], axis=1), ((0, 0), (len(z), 1))), of_w])
         return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
 
-    def rows(self, X: Unknowns, values: Float[Array, "2 values"], near: Unknowns) -> Array:
-        """Return the residual G of the equations. `values`: results of the program for a and for b."""
+    def turned(self, X: Unknowns) -> Float[Array, "2 states"]:
+        """Return the columns of (a b) S(w)."""
         (_, a, b, w), (of_w, fixed) = self.parts(X), np.reshape(SHAPES[self.kind], (2, 2, 2))
+        return (of_w * w + fixed).T @ jnp.stack([a, b])
+
+    def rows(self, values: Float[Array, "2 values *more"], turned: Float[Array, "2 states *more"]) -> Array:
+        """Return the rows of G or G_X, without those of L, from results of the program for a and for b."""
         count = len(self.equations.rows)
         R, Fx, Cx = jnp.split(values, [count, count + len(self.equations.states)], axis=1)
-        left, (L, c) = Fx - (of_w * w + fixed).T @ jnp.stack([a, b]), self.linear(near)
-        return jnp.concatenate([R[0], jnp.ravel(left), jnp.ravel(Cx), L @ X - c])
+        return jnp.concatenate([R[0], *(Fx - turned), *Cx])
 
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
         """Return the residual G of the equations."""
-        return self.rows(X, self.each(self.program.values, scene, X), near)
+        L, c = self.linear(near)
+        values = self.each(self.program.values, scene, X)
+        return jnp.concatenate([self.rows(values, self.turned(X)), L @ X - c])
 
     def each(self, function: Callable, scene: Scene, X: Unknowns):
         """Return results of a function of all arguments of the program, for a and for b."""
@@ -187,14 +187,12 @@ class Special(eqx.Module):
 
     def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
         """Return the Jacobian and the residual, (G_X, G), as one matrix."""
-        values, D, _ = self.each(self.program.of, scene, X)
-
-        def along(dX):
-            change = dX, jnp.einsum("kij,kj->ki", D, self.places(dX))
-            return jax.jvp(lambda *at: self.rows(*at, near), (X, values), change)
-
-        G, J = jax.vmap(along, out_axes=(None, 1))(jnp.eye(len(X)))
-        return jnp.column_stack([J, G])
+        (L, c), (values, D, _) = self.linear(near), self.each(self.program.of, scene, X)
+        of_z, of_x = jnp.split(D, [len(self.equations.places)], axis=2)
+        of_ab = jnp.einsum("kij,kl->kilj", of_x, jnp.eye(2)).reshape(*of_x.shape[:2], -1)
+        slopes = jnp.concatenate([of_z * self.equations.size, of_ab, jnp.zeros((*of_x.shape[:2], 1))], axis=2)
+        J, G = self.rows(slopes, jax.jacfwd(self.turned)(X)), self.rows(values, self.turned(X))
+        return jnp.column_stack([jnp.concatenate([J, L]), jnp.concatenate([G, L @ X - c])])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
         """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""
