@@ -15,10 +15,10 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 473_986,
+    "code tokens of src": 473_414,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
-    "caches": 50,
+    "caches": 51,
     "named numbers": 300,
     "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,

@@ -141,22 +141,16 @@ class Special(eqx.Module):
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
-    def normal(self, X: Unknowns) -> Unknowns:
-        """Return X scaled to unit length of a, or of a + i b for a pair."""
-        z, a, b, w = self.parts(X)
-        size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
-        return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
-
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
         """Return L and c of the linear equations `L X = c`. They fix the held values, the size and phase of a
         and b (relative to the point `near`), and w if it is zero.
         """
         z, a0, b0, _ = self.parts(near)
-        no, held = 0 * a0, self.equations.held
+        no, held, size = 0 * a0, self.equations.held, a0 @ a0
         of_ab = {  # for a zero eigenvalue, b is zero unless steady motions continue at the same parameters
-            PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)],
-            DOUBLE: [(a0, no, 1.0), (no, a0, 0.0)],
-            ZERO: [(a0, no, 1.0), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
+            PAIR: [(a0, b0, size + b0 @ b0), (-b0, a0, 0.0)],
+            DOUBLE: [(a0, no, size), (no, a0, 0.0)],
+            ZERO: [(a0, no, size), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
         }[self.kind]
         a, b, c = (jnp.array(x) for x in zip(*of_ab, strict=True))
         of_z, of_w = jnp.eye(len(z), len(near))[held], jnp.eye(len(near))[-1:] * (self.kind == ZERO)
@@ -246,7 +240,7 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     be below 1e-7.
     """
     zero, none = jnp.array(0.0), jnp.array(0)
-    start = _Followed(special.normal(special.X), zero, zero + 1, none, jnp.array(False))
+    start = _Followed(special.X, zero, zero + 1, none, jnp.array(False))
     found = _to_the_end(special, scene, start)
     X = found.X - special.correction(scene, found.X, found.X)
     change, inverse, condition = special.inverse(scene, X, found.X)
@@ -270,7 +264,7 @@ def _once(special: Special, scene: Scene, at: _Followed) -> _Followed:
 
     X, (first, second, third) = jax.lax.scan(corrected, at.X, length=3)
     good = (first < 1) & (second <= 0.3 * first + 1e-9) & (third <= 0.3 * second + 1e-9)
-    X, done = jnp.where(good, special.normal(X), at.X), jnp.where(good, share, at.done)
+    X, done = jnp.where(good, X, at.X), jnp.where(good, share, at.done)
     step = jnp.where(good, 2 * at.step, at.step / 4)
     return _Followed(X, done, step, at.tries + 1, good & (share == 1) & (third**2 <= 1e-7 * second))
 
