@@ -205,7 +205,7 @@ def test_energy_falls_by_what_events_take():
     assert_allclose(motion.phases.lost[:3], [9.81 * (1 - 0.49) * 0.49**k for k in range(3)], rtol=1e-11)
     assert_allclose(motion.energies().balance, 9.81, rtol=1e-12)
     assert not motion.warnings
-    assert "floor" in str(motion.phases)
+    assert "floor" in str(motion)
     assert "took" in str(motion.phases)
 
 
