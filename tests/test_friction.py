@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from derivatives import with_value
 from numpy.testing import assert_allclose, assert_array_equal
+from result_codes import AMBIGUOUS, SUCCESS
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import measured_bicycle, shipped_bicycles
@@ -312,7 +313,7 @@ def test_an_impact_that_would_gain_energy_has_a_code():
     struck = jj.simulate(DoublePendulum(), start | back, t1=0.1)
     assert "would gain energy" in struck.message
     at_once = jj.simulate(DoublePendulum(), start, t1=0.1)
-    assert "Coulomb's law has no solution" in at_once.message
+    assert "would gain energy" in at_once.message
 
 
 class Energetic(Ball):
@@ -729,7 +730,7 @@ def test_bodies_dropped_on_two_contacts_in_space():
     rollout = jj.rollout(Scooter(**SCOOTER), start, t1=1.5, rtol=1e-8, atol=1e-8)
     reached = np.asarray(rollout.result) == 0
     assert reached.sum() >= 0.9 * count
-    assert set(np.asarray(rollout.result)[~reached].tolist()) <= {19, 21}
+    assert set(np.asarray(rollout.result)[~reached].tolist()) <= {19, 21, 24}
     for lane in np.flatnonzero(reached)[:20]:
         balance = rollout.lane(int(lane)).energies().balance
         assert_allclose(balance, balance[0], atol=1e-6)
@@ -887,6 +888,31 @@ def test_a_body_with_friction_sets_off_from_its_event():
     assert_allclose(lanes.q_end[1, 0], 0.125 / 1.4, atol=1e-9)
 
 
+class Sled(jj.Scene):
+    """A body on a blade that holds up to 3 N, with friction of its heading."""
+
+    coordinates = jj.coordinates("x y heading")
+
+    def bodies(self, t, q):
+        return {"sled": jj.RigidBody(2.0, jnp.ones(3), [q.x, q.y, 0.0], jj.rot_z(q.heading))}
+
+    def velocity_constraints(self, motion):
+        sled = motion["sled"]
+        return {"blade": jj.knife_edge(sled, sled.position, sled.orientation[:, 1], holds=3.0)}
+
+    def loads(self, motion):
+        return jj.joint_friction(motion, heading_rate=jj.Coulomb(0.1, static=0.2))
+
+
+def test_dense_matrices_move_a_scene_with_friction_that_was_lowered():
+    """Both start from one trace of the scene, which lowering must not change."""
+    start, ends = {"x_rate": 2.0, "heading_rate": 1.0}, []
+    for backend in ("native", "dense"):
+        motion = jj.simulate(Sled(), start, ts=[1.5], backend=backend, **FINE)
+        ends.append([*motion.q_end[:3], *motion.phase("blade"), *motion.phase("heading_rate")])
+    assert_allclose(ends[0], ends[1], rtol=1e-10)
+
+
 class Braking(jj.Scene):
     """A bicycle in its plane: the rear wheel turns, all else is one body, since the front wheel is locked."""
 
@@ -955,3 +981,44 @@ def test_measured_bicycles_brake():
     assert (rear[1::2] == 0).all()
     assert_allclose(pitch[::2], 0.0, atol=1e-12)
     assert (pitch[1::2, 1] > 0.01).all()
+
+
+def grip_and_lift(own, friction):
+    """Grip that the rear wheel has left (N) if it rolls, and acceleration of its hub (m/s^2) if it lifts, by
+    forces and moments while the front wheel slides. Unknowns: x'', z'' of the hub, pitch'', turn'', front
+    load, rear load, rear friction.
+    """
+    m, M, I, J, R = (own[name] for name in ("mass", "wheel", "inertia", "turning", "rear"))
+    X, Z, w = own["x"], own["z"] - R, own["base"]
+    balance = [
+        [m + M, 0, m * Z, 0, friction, 0, -1],
+        [0, m + M, -m * X, 0, -1, -1, 0],
+        [m * Z, -m * X, I + m * (X * X + Z * Z), 0, w - friction * R, 0, 0],
+        [0, 0, 0, J, 0, 0, R],
+        [0, 1, -w, 0, 0, 0, 0],
+    ]
+    right = [0.0, -(m + M) * G, m * G * X, 0.0, 0.0, 0.0, 0.0]
+    rolls = [[0, 1, 0, 0, 0, 0, 0], [1, 0, 0, -R, 0, 0, 0]]
+    lifts = [[0, 0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0, 1]]
+    *_, load, needed = np.linalg.solve(balance + rolls, right)
+    return friction * load - abs(needed), np.linalg.solve(balance + lifts, right)[1]
+
+
+def test_a_bicycle_that_may_roll_as_well_as_lift_has_a_code():
+    """Just above mu h = w - b the rear wheel of the benchmark bicycle may roll, since its friction brakes it,
+    or lift.
+    """
+    own, limit = braking(measured_bicycle("Benchmark").values)
+    friction = limit * jnp.array([0.999, 1.001, 1.003])
+    may = np.array([grip_and_lift(own, mu) for mu in friction]) > 0
+    assert may.tolist() == [[True, False], [True, True], [False, True]]
+
+    def stopping(friction):
+        scene = Braking(**own | {"friction": friction})
+        start = {"z": scene.rear, "x_rate": 6.0, "turn_rate": 6.0 / scene.rear}
+        motion = jj.simulate(scene, start, ts=[0.1], rtol=1e-9, atol=1e-9)
+        return motion.result, motion.phase("rear")[0]
+
+    result, rear = jax.vmap(stopping)(friction)
+    assert result.tolist() == [SUCCESS, AMBIGUOUS, SUCCESS]
+    assert [rear[0], rear[2]] == [1, 0]

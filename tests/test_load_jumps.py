@@ -87,18 +87,6 @@ def warned(f, *arguments):
     ]
 
 
-@pytest.mark.parametrize("name", JUMPS)
-def test_jumps_are_seen(name):
-    assert jj.lower(Pushed(push=JUMPS[name])).jumps
-
-
-@pytest.mark.parametrize("name", KINKS)
-def test_kinks_are_no_jumps(name):
-    program = jj.lower(Pushed(push=KINKS[name]))
-    moving = [n for n in program.jumps if set(program.graph.reachable([n])) & set(program.traced.q.tolist())]
-    assert not moving
-
-
 def test_a_derivative_across_a_jump_warns_where_no_step_ends_there():
     f = end(JUMPS["at a place"])
     assert not warned(jax.grad(f), -1.0)

@@ -12,9 +12,11 @@ import pytest
 from baselines.hand_derived import HAND_DERIVED, operations
 from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, OnPlane, Upright
+from test_load_jumps import JUMPS, KINKS, Pushed
 
 import jourdain_jax as jj
 from jourdain_jax.lowering import lower as module
+from jourdain_jax.lowering.sides import may_jump
 from jourdain_jax.models import MODELS
 from jourdain_jax.program import numpy_backend
 from jourdain_jax.program.emit import fused
@@ -433,3 +435,13 @@ def test_no_scene_is_said_to_have_derivatives_of_its_own_that_has_none():
             else jj.lower(scene, every_speed=True).summary()
         )
         assert "custom derivative" not in said
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_jumps_are_seen(name):
+    assert may_jump(Pushed(push=JUMPS[name]), True, False)
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_kinks_are_no_jumps(name):
+    assert not may_jump(Pushed(push=KINKS[name]), False, False)

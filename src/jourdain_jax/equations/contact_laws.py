@@ -14,6 +14,7 @@ of the limit directions: M. Antali and G. Stepan, Nonlinear Dynamics 97 (2019) 1
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ SWEEPS, STEPS = 4, 5  # numerics
 SLOW = 5e-6  # numerics, m/s: slower slip changes its direction as if it had this speed
 ROUND_OFF = 1e-9  # numerics: relative, of responses
 LEAST_SLIP = 1e-8  # numerics, m/s: round-off of speeds that impulses change
+DIFFERS = 1e-6  # numerics: relative difference of responses from which on two solutions differ
 LEAST_PIVOT = 1e-12  # numerics: relative to the diagonal entry before elimination
 
 
@@ -126,6 +128,7 @@ class Solution(NamedTuple):
     P: ContactVectors
     modes: Modes
     holds: ContactFlags
+    several: Flag  # whether forces in other modes satisfy the law, too, with another response
 
 
 @jax.jit
@@ -152,7 +155,26 @@ def coulomb(law: Law) -> Solution:
     for _ in range(STEPS + count - 1):
         P, e = _improved(law, P, modes)
         found, modes = modes._replace(direction=e), _modes(law, P)
-    return Solution(P, found, holds(law, P, found))
+    return _in_other_modes(law, Solution(P, found, holds(law, P, found), jnp.asarray(False)))
+
+
+def _in_other_modes(law: Law, found: Solution) -> Solution:
+    """Return the solution after a trial of all combinations of open and closed contacts. If `found` does not
+    satisfy the law, a combination that does replaces it; if both do, there are several solutions.
+    """
+    (closed, rolls, e), several = found.modes, found.several
+    if_closed = jnp.where(law.slides, 0.0, jnp.where(closed > 0, rolls, 1.0))
+    wanted = law.b - jnp.zeros_like(found.P).at[:, 0].set(law.target).ravel()
+    for tried in product((0.0, 1.0), repeat=len(closed)):
+        now = jnp.where(law.touches, jnp.array(tried), 0.0)
+        modes = Modes(now, now * if_closed, e)
+        P = responses(law.G, wanted[:, None], modes, law.friction).reshape(-1, 3)
+        other, right = Solution(P, modes, holds(law, P, modes), several), jnp.all(found.holds)
+        off = jnp.sum(jnp.abs(law.G @ (P - found.P).ravel())) > DIFFERS * jnp.sum(jnp.abs(law.b))
+        fits = jnp.all(other.holds)
+        several |= right & fits & off
+        found = jax.tree.map(partial(jnp.where, fits & ~right), other, found)
+    return found._replace(several=several)
 
 
 @partial(jax.jit, static_argnums=2)

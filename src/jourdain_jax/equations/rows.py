@@ -28,7 +28,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.contact.contacts import Contact, Coulomb
 from jourdain_jax.scene.identity import once_per_class
-from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.loads import HeldRow, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import (
@@ -183,38 +183,15 @@ class ContactRows(eqx.Module):
     drift: PerRow
 
 
-class SwitchingRow(NamedTuple):
-    """A contact with friction, or a constraint that holds until its force exceeds a limit."""
-
-    friction: Coulomb
-    slip: Float[Array, "2"]  # m/s or rad/s
-    contact: Contact | None  # None: a constraint, with unit normal force
-
-    @property
-    def restitution(self) -> Scalar:
-        """Return Newton's coefficient of restitution; zero for constraints."""
-        return jnp.zeros_like(self.slip[0]) if self.contact is None else jnp.asarray(self.contact.restitution)
-
-    @property
-    def impact(self) -> str:
-        """Return the law of impacts."""
-        return "moreau" if self.contact is None else self.contact.impact
-
-    def lean(self) -> Scalar | None:
-        """Return the lean of a disc or wheel (`Contact.lean`)."""
-        return None if self.contact is None else self.contact.lean()
-
-
-def switching_rows(scene: Scene, motion: Motion) -> dict[str, SwitchingRow]:
-    """Return the contacts with friction and the constraints with a force limit, in the order of
-    their modes.
+def switching_rows(
+    scene: Scene, motion: Motion
+) -> dict[str, tuple[Contact | HeldRow, Coulomb, Float[Array, "2"]]]:
+    """Return the contacts with friction and the constraints with a force limit, in the order of their modes,
+    each with its friction and its slip (m/s or rad/s).
     """
     contacts = contacts_of(scene, motion.pose())
-    found = {
-        name: SwitchingRow(c.friction, slip_of(c, motion), c) for name, c in contacts.items() if c.friction
-    }
-    rows = held_rows_of(scene, motion).items()
-    found |= {name: SwitchingRow(row.friction, row.slip, None) for name, row in rows}
+    found = {name: (c, c.friction, slip_of(c, motion)) for name, c in contacts.items() if c.friction}
+    found |= {name: (row, row.friction, row.slip) for name, row in held_rows_of(scene, motion).items()}
     return {name: found[name] for name in scene.switching.contacts}
 
 
@@ -228,7 +205,7 @@ def gaps_of(scene: Scene, pose: Pose) -> PerContact:
 def contact_speeds(scene: Scene, motion: Motion) -> PerRow:
     """Return the rates of the gaps, and the slip along both tangents, of all switching contacts, in m/s."""
     rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
-    slips = [row.slip for row in switching_rows(scene, motion).values()]
+    slips = [slip for *_, slip in switching_rows(scene, motion).values()]
     return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
 
 
@@ -254,10 +231,10 @@ def contact_loads(
     limit give the forces `A' L` on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
-    for i, (row, (normal, *tangential)) in enumerate(
+    for i, ((contact, *_), (normal, *tangential)) in enumerate(
         zip(switching_rows(scene, motion).values(), forces.reshape(-1, 3), strict=True)
     ):
-        if (contact := row.contact) is None:
+        if isinstance(contact, HeldRow):
             loads.append(Load(generalized=dict(zip(speeds, along[i] * tangential[0], strict=True))))
             continue
         force = normal * contact.plane.normal + jnp.stack(tangential) @ contact.plane.tangents

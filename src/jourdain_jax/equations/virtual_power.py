@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, PerCoordinate, PerRow, Scalar, Speeds, check_kind
+from jourdain_jax.calculus.reals import Entries, PerContact, PerCoordinate, PerRow, Scalar, Speeds, check_kind
 from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
@@ -255,24 +255,30 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
     # a constraint with a force limit has unit normal force, the solution of L_n - 1 = 0
-    held_rows = [[row.contact is None, 0, 0] for row in switching_rows(scene, motion).values()]
-    one = jnp.array(held_rows, free.dtype).ravel()
+    names, held_rows = scene.switching.contacts, scene.switching.rows
+    one = jnp.array([[name in held_rows, 0, 0] for name in names], free.dtype).ravel()
     G, b = rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one
     return ContactResponse(rows, impulses, G, b)
+
+
+def numbers_and_slots(scene: Scene, motion: Motion) -> tuple[PerContact, Float[Array, "contacts 2"]]:
+    """Return the number of the mode of each switching contact, and the two coordinates that it adds to the
+    state. They hold its direction of slip, or when its bounces end (`equations/phases.py`).
+    """
+    count = len(scene.switching.contacts)
+    return motion.inputs.array[-count:], motion.q.array[-2 * count :].reshape(-1, 2)
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
     """Return the modes of the switching contacts and their directions of slip, which are part of the state.
     The direction is zero unless a contact slips or creeps.
     """
-    names = scene.switching.contacts
-    number = jnp.stack([motion.modes[name] for name in names])
-    e = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
+    number, slots = numbers_and_slots(scene, motion)
     one = jnp.ones_like(number)
     return Modes(
         jnp.where(number == FLIES, 0.0, one),
         jnp.where(number == ROLLS, one, 0.0),
-        e * (number >= SLIPS)[:, None],
+        slots * (number >= SLIPS)[:, None],
     )
 
 
@@ -281,12 +287,11 @@ def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Ar
 
     de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
     """
-    e = contact_modes(scene, motion).direction
-    slips = jnp.stack([motion.modes[name] for name in scene.switching.contacts]) == SLIPS
+    e, (number, _) = contact_modes(scene, motion).direction, numbers_and_slots(scene, motion)
     dw = (found.G @ switching_forces(scene, motion, found) + found.b).reshape(-1, 3)[:, 1:]
     along = jnp.sum(e * found.rows.w.reshape(-1, 3)[:, 1:], axis=1)
     aside = e[:, 0] * dw[:, 1] - e[:, 1] * dw[:, 0]
-    rate = aside / jnp.where(slips, along, SLOW)
+    rate = aside / jnp.where(number == SLIPS, along, SLOW)
     return (rate[:, None] * jnp.stack([-e[:, 1], e[:, 0]], axis=1)).ravel()
 
 
@@ -300,7 +305,7 @@ def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> PerCoordinate:
 
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> PerRow:
     """Return the forces of contacts in their modes, N."""
-    friction = jnp.stack([row.friction.sliding for row in switching_rows(scene, motion).values()])
+    friction = jnp.stack([friction.sliding for _, friction, _ in switching_rows(scene, motion).values()])
     return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction)[:, 0]
 
 

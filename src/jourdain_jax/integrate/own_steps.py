@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -26,13 +25,12 @@ from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Found, Start, flow
 from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
-from jourdain_jax.integrate.loop.time_functions import driven, may_jump
+from jourdain_jax.integrate.loop.time_functions import driven, function_may_jump
 from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved, Times
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
-from jourdain_jax.lowering.sides import loads_have_relations, loads_may_jump, with_sides
-from jourdain_jax.program.evaluate import depend_on
+from jourdain_jax.lowering.sides import loads_have_relations, may_jump, with_sides
 from jourdain_jax.program.graph import ARRAYS
 from jourdain_jax.scene.scene import Scene
 
@@ -222,7 +220,7 @@ def reason_against_watching(setup: Setup) -> str:
 def _reason_against_sides(setup: Setup) -> str:
     """Return why relations of the scalar program are not monitored; empty if they are or there are none."""
     if setup.field.lowered is None:
-        jump = loads_have_relations(setup.scene) or any(map(may_jump, setup.inputs.programs))
+        jump = loads_have_relations(setup.scene) or any(map(function_may_jump, setup.inputs.programs))
         return "the scene has no scalar program" if jump else ""
     program, numbers = _relations(
         setup.field.lowered, setup.inputs, has_events := bool(setup.integrator.event_names)
@@ -252,19 +250,14 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`: relations are
     monitored.
     """
+    if watched and field.lowered is not None:
+        program, numbers = _relations(field.lowered, inputs, False)
+        if set(numbers) <= set(program.sided):
+            return False
     functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)]
-    if field.lowered is None:
-        return loads_may_jump(scene) or any(may_jump(x.program, _varying(x)) for x in functions)
-    program, _ = _relations(field.lowered, inputs, False)
-    left_out = [n for n in program.jumps if not watched or n not in program.sided]
-    if not left_out:
-        return False
-    merged = program is not field.lowered
-    numbers = [varies for x in functions if merged for varies in _varying(x)]
-    others = _traced(others_of(inputs) if merged else inputs.channels)
-    count = len(program.traced.q) + len(program.independent)
-    varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
-    return any(depend_on(program.graph, left_out, compress(program.variables, varies)))
+    if any(function_may_jump(x.program, _varying(x)) for x in functions):
+        return True
+    return may_jump(scene, scene_varies, any(_traced(inputs.channels)))
 
 
 def _varying(channel: FunctionOfTime) -> list[bool]:

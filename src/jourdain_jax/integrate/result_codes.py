@@ -30,6 +30,7 @@ CONTACTS_UNDECIDED = 21  # code
 LIES_FLAT = 22  # code
 STICKS = 23  # code
 ZENO = 24  # code
+AMBIGUOUS = 25  # code
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 
 MESSAGES = {
@@ -50,8 +51,7 @@ MESSAGES = {
     ),
     INCONSISTENT_START: (
         "the start does not satisfy the constraints and could not be projected onto them; or "
-        "a body starts below the ground of a contact with friction; or Coulomb's law has no solution for its "
-        "contacts (an impact that gains energy, Painleve's paradox)"
+        "a body starts below the ground of a contact with friction"
     ),
     SINGULAR_PARTITION: (
         "near the last time the independent speeds do not determine the others, or the scene's "
@@ -120,7 +120,12 @@ MESSAGES = {
     ),
     ZENO: (
         "events follow each other within round-off, like the last bounces of a ball: let an event switch to "
-        "a mode of rest, or use a contact with `friction=`, which comes to rest"
+        "a mode of rest, or use a contact with `friction=`, which comes to rest if its bounces shrink by a "
+        "steady ratio; otherwise reduce `restitution=`"
+    ),
+    AMBIGUOUS: (
+        "contacts with friction may move in several ways: open as well as stay closed, by Coulomb's law; "
+        "reduce the friction, or start with a small speed in one of these ways"
     ),
     UNSOLVED_STEP: (
         "the equations of an implicit step were not solved near the last time; use a shorter "

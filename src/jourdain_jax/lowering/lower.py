@@ -27,7 +27,7 @@ from jourdain_jax.lowering.comparison import (
 from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.multipliers import KeptRows
-from jourdain_jax.lowering.relations import jumps, relations, sided
+from jourdain_jax.lowering.relations import relations, sided
 from jourdain_jax.program.evaluate import Probes, part_of
 from jourdain_jax.program.graph import Graph, NodeList, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
@@ -205,7 +205,6 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     )
     every = [n for part in watched for n in part]
     nodes["sided"] = sided(graph, every, [*rates, *nodes["events"]], probes)
-    nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     nodes["fixed"], own = graph.fixed([*outputs, *every]), builder.traced
     given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist()]
     given += [n for x in own.parameters for n in x.ravel().tolist()]

@@ -25,7 +25,7 @@ Nodes = tuple[int, ...]  # node indices
 # fields of a program that contain nodes, except `power`
 NODES = (
     *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
-    *("projected_q", "projected_u", "relations", "event_relations", "sided", "jumps"),
+    *("projected_q", "projected_u", "relations", "event_relations", "sided"),
 )
 
 
@@ -80,7 +80,6 @@ class Lowered:
     relations: Nodes  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
     event_relations: Nodes  # further such numbers, of the events
     sided: Nodes  # such numbers whose branches are both defined beyond the zero (`lowering/sides.py`)
-    jumps: Nodes  # such numbers at whose zeros rates may jump
     projected_q: Nodes  # coordinates projected onto norms and geometric constraints, one step of Gauss-Newton
     projected_u: Nodes  # all speeds projected onto the constraints; empty if dependent speeds are eliminated
     at_start: Nodes  # switching contacts at the start of a motion (`contacts_at_start`)

@@ -59,7 +59,7 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
     nodes = {name: getattr(program, name) for name in NODES}
     new = graph.copied([program.power, *numbers, *(n for part in nodes.values() for n in part)], old, new)
     copied: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
-    copied |= dict.fromkeys(("relations", "event_relations", "jumps"), ())
+    copied |= dict.fromkeys(("relations", "event_relations"), ())
     x = [
         _counted(graph, old, first[n][0], new) if whole else new[n]
         for n, whole in zip(numbers, wholes, strict=True)
@@ -167,20 +167,18 @@ def loads_have_relations(scene: Scene) -> bool:
     return bool(switches(traced.graph, _loads(scene, traced)))
 
 
-def loads_may_jump(scene: Scene) -> bool:
-    """Return whether loads or masses jump at some state or parameter. Jumps at fixed times do not count,
-    because derivatives are correct there.
+def may_jump(scene: Scene, scene_varies: bool, inputs_vary: bool) -> bool:
+    """Return whether loads, masses or constraints jump at a place or time that varies. It depends on the
+    state, or on parameters or inputs if they vary. Derivatives are correct at jumps at other times.
     """
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
-    graph, loads = traced.graph, list(_loads(scene, traced))
-    moving = [
-        *traced.q.tolist(),
-        *traced.u.tolist(),
-        *(n for leaf in traced.parameters for n in leaf.ravel().tolist()),
-    ]
-    numbers = [n for n in switches(graph, loads) if depend_on(graph, [n], moving)[0]]
-    return bool(numbers) and bool(jumps(graph, numbers, loads, _probes(scene, traced)))
+    graph, outputs = traced.graph, [*_loads(scene, traced), *traced.at.phi.tolist(), *traced.at.qdot.tolist()]
+    moving = [*traced.q.tolist(), *traced.u.tolist()]
+    moving += traced.inputs[: len(scene.inputs) - len(scene.modes.names)].tolist() if inputs_vary else []
+    moving += [n for leaf in traced.parameters for n in leaf.ravel().tolist()] if scene_varies else []
+    numbers = [n for n in switches(graph, outputs) if depend_on(graph, [n], moving)[0]]
+    return bool(numbers) and bool(jumps(graph, numbers, outputs, _probes(scene, traced)))
 
 
 def bent_load(scene: Scene, t, q, u, inputs) -> str:

@@ -280,6 +280,9 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
         right, finite = value_kernels.are_right(program, scene, *at, nowhere if unneeded else others.ravel())
     fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
     code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
+    worst = jnp.min(at[-1][len(scene.inputs) - len(scene.switching.contacts) :], initial=0.0)
+    why = result_codes.IMPACT_GAINS_ENERGY - 1 - worst  # negative modes are codes
+    code = jnp.where(worst < 0, why.astype(code.dtype), code)
     code = jnp.where(finite, code, result_codes.BAD_START)
     if timely is not np.True_:
         code = jnp.where(timely, code, result_codes.BAD_TIMES)

@@ -22,7 +22,7 @@ Each is treated as a contact with friction, whose normal force is one newton and
 friction are the forces F. It then has the modes, events and derivatives of contacts (`equations/phases.py`).
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -204,16 +204,21 @@ class HeldRow(eqx.Module):
 
     w: Scalar
     friction: Coulomb
+    restitution: Scalar  # as of a contact: zero
+    impact: ClassVar[str] = "moreau"
 
     def __init__(self, w: Any, friction: Any, what: str):
-        self.w = w
+        self.w, self.restitution = w, jnp.zeros_like(w)
         known = isinstance(friction, Coulomb)
         self.friction = friction if known else Coulomb(checked_real(friction, f"friction of {what}", ()))
 
     @property
     def slip(self) -> Float[Array, "2"]:
         """Return the slip in the form of contacts, with two tangents; the second entry is zero."""
-        return jnp.stack([self.w, jnp.zeros_like(self.w)])
+        return jnp.stack([self.w, self.restitution])
+
+    def lean(self) -> None:
+        """Return None: a constraint cannot lie flat."""
 
 
 class JointFriction(Load):

@@ -14,8 +14,9 @@ called "holds". For a contact `rim` the scene gets
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
-    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero unless it slips; the time at
-                                                   which its bounces end, and 1, during their last flight
+    coordinates `rim_slip_1`, `rim_slip_2`         its direction while it slips; else zero, or the speed
+                                                   of its last rebound, and 0; during the last flight of
+                                                   its bounces the time at which they end, and 1
 
 `equations/phases.py` has the mechanics.
 """
@@ -115,9 +116,9 @@ class Event:
     stop: bool = False
 
 
-FLIES, ROLLS, SLIPS, CREEPS = range(4)
-# values of a mode that tell why a motion cannot continue
-GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT = -1, -2, -3, -4  # code
+FLIES, ROLLS, SLIPS, CREEPS = map(float, range(4))
+# values of a mode that tell why a motion cannot continue, in the order of the result codes
+GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT, _, _, AMBIGUOUS = map(float, range(-1, -8, -1))
 MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
 MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # a constraint never flies
 EVENTS_OF_CONTACT = ("normal", "tangent", "speed")

@@ -80,7 +80,7 @@ class VelocityQuantities(eqx.Module):
     slip_turns: Num[Entries, "directions"]  # rates of directions of slip, the last coordinates
     # projected onto the constraints of closed contacts; empty without switching contacts
     held: Num[Entries, "coordinates_and_speeds"]
-    start: Num[Entries, "numbers"]  # `phases.Begun`
+    start: Num[Entries, "numbers"]  # `contacts_at_start`
     # for each state of switching contacts: coordinates, speeds, inputs, and the response (`ContactResponse`)
     responses: Num[Entries, "states numbers"]
 
@@ -144,7 +144,7 @@ def velocity_quantities(
         jnp.stack(energies_at(scene, motion, stated)),
         slip_turns(scene, motion, at.found) if at else jnp.zeros(0),
         jnp.concatenate(put_back(at)) if at else jnp.zeros(0),
-        ravel_pytree(contacts_at_start(at))[0] if at and with_events else jnp.zeros(0),
+        contacts_at_start(at) if at and with_events else jnp.zeros(0),
         jnp.stack([ravel_pytree(response)[0] for response in at.responses]) if at else jnp.zeros((0, 0)),
     )
 
@@ -239,9 +239,9 @@ def traced_scene(scene: Scene, of_inputs: Indices = ()) -> TracedScene:
     if isinstance(found, str):
         raise Unsupported(found)
     graph = copy(found.graph)
-    # copy its lists as well, since nodes may be added to them
+    # copy its lists and the arrays of nodes as well, since both may be changed
     vars(graph).update({name: copy(x) for name, x in vars(graph).items()})
-    return replace(found, graph=graph)
+    return replace(found, graph=graph, at=jax.tree.map(np.copy, found.at))
 
 
 def jaxpr_of_scene(scene: Scene, of_inputs: Indices):

@@ -63,7 +63,6 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
     on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
     on_it["sided"] += go_on
-    on_it["jumps"] += jumps(graph, by_functions, of_functions, probes)
     stays = [i for i, function in enumerate(functions) if function is None]
     u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are not variables
     q, inputs = (
@@ -105,7 +104,7 @@ def _on_graph(graph: Graph, function: TimeProgram, t: int, name: str) -> tuple[l
     return [n for part in given for n in part], int(as_nodes(graph, value))
 
 
-def may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
+def function_may_jump(function: TimeProgram, varies: Sequence[bool] | None = None) -> bool:
     """Return whether a function of time jumps. `varies`: flags of its numbers; then only jumps count whose
     times depend on a flagged number.
     """

@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Indices, PerLane, Scalar, Speeds, check_kind, described, static
@@ -278,10 +277,8 @@ class VectorField(eqx.Module):
         return jnp.delete(found, np.array(left_out, int), axis=1)
 
     def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
-        """Return the switching contacts at the start (q, u) of a motion: the result of `contacts_at_start` as
-        one vector.
-        """
-        return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
+        """Return the switching contacts at the start (q, u) of a motion (`contacts_at_start`)."""
+        return contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs)))
 
     def energies(self, at: Instant) -> Float[Array, "2"]:
         """Return the kinetic and potential energy (J). They have no derivatives."""
