@@ -139,14 +139,10 @@ MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8  # numerics
 class RowFunctions(NamedTuple):
     """Functions that evaluate a scene's constraints, their derivatives and the mass matrix."""
 
-    closures: Callable  # (scene, t, q) -> g, G
-    rows: Callable  # (scene, t, q, u, inputs) -> phi, A
-    masses: Callable  # (scene, t, q) -> M
-    parameters: Callable | None = None  # scene -> first argument of `closures` and `rows`; None: the scene
-
-    def given(self, scene: Scene):
-        """Return the first argument of `closures` and `rows` for a scene."""
-        return scene if self.parameters is None else self.parameters(scene)
+    closures: Callable  # (given, t, q) -> g, G
+    rows: Callable  # (given, t, q, u, inputs) -> phi, A
+    masses: Callable  # (given, t, q) -> M
+    given: Callable = lambda scene, *_: scene  # from a scene and `plain` of `project_speeds`
 
 
 def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
@@ -177,12 +173,14 @@ def project_positions(
     iterations: int = MOST_MOVES_OF_POSITIONS,
     typical=None,
     by: RowFunctions = BY_AUTODIFF,
+    plain: tuple[Scene, ...] = (),
 ) -> PerCoordinate:
     """Return coordinates near q on the geometric constraints, after at most `iterations` corrections; only
     `free` coordinates move.
 
     `typical`: typical lengths of the rows of G, from `closure_lengths`; a row that is mere round-off relative
-    to its typical length counts as zero (default: no row does). `by`: the evaluation of the constraints.
+    to its typical length counts as zero (default: no row does). `by`: the evaluation of the constraints;
+    `plain`: as in `project_speeds`.
     """
     if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
@@ -192,11 +190,12 @@ def project_positions(
 
     def step(given, q):
         at, (free, typical) = given
-        g, G = by.closures(*at, q)
+        g, G = by.closures(*at[:2], q)
         return q - least_change(G, g, None, free, typical).x
 
-    prepare = None if by.parameters is None else lambda a: ((by.given(a[0][0]), a[0][1]), a[1])
-    return fixed_point(step, ((scene, jnp.asarray(t)), (free, typical)), q, iterations, prepare)
+    prepare = lambda a: ((by.given(a[0][0], *a[0][2:]), a[0][1]), a[1])
+    given = (scene, jnp.asarray(t), *plain), (free, typical)
+    return fixed_point(step, given, q, iterations, None if by.given is BY_AUTODIFF.given else prepare)
 
 
 def _normalised(scene: Scene, q: PerCoordinate) -> PerCoordinate:
@@ -225,6 +224,7 @@ def project_speeds(
     affine: bool = False,
     determined: bool = False,
     by: RowFunctions = BY_AUTODIFF,
+    plain: tuple[Scene, ...] = (),
 ) -> Speeds:
     """Return the speeds that satisfy the velocity constraints, nearest to u in the metric of the mass matrix;
     only `free` speeds change.
@@ -237,12 +237,13 @@ def project_speeds(
     - `determined`: whether affine constraints determine all `free` speeds. No metric is then used, and
       `typical` is in plain speeds.
     - `by`: the evaluation of constraints and mass matrix.
+    - `plain`: if lanes may share the numbers of the scene, the same scene without derivatives.
     """
     if not names_of_rows(scene):
         return u
     free = jnp.ones(u.shape, bool) if free is None else jnp.asarray(free)
-    parameters = by.given(scene)
-    M = None if determined else by.masses(scene, t, q)
+    parameters = by.given(scene, *plain)
+    M = None if determined else by.masses(parameters, t, q)
 
     def change(given, u):
         (parameters, t, q, inputs, M), (free, typical) = given

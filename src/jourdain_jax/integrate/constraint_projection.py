@@ -51,6 +51,7 @@ class Usual(eqx.Module):
     affine: bool = static()  # constraints are affine in the speeds
     determined: bool = static()  # constraints determine the free speeds
     program: RowProgram | None = static()  # program for projection by machine code; None: use XLA
+    plain: tuple[Scene, ...] = ()  # as in `project_speeds`
 
 
 def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
@@ -86,11 +87,11 @@ def put_positions(
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
 
-    def by_xla(by: RowFunctions, scene, t, q, free, lengths):
-        near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
-        return near_q, by.closures(by.given(scene), t, near_q)[0]
+    def by_xla(by: RowFunctions, scenes, t, q, free, lengths):
+        near_q = project_positions(scenes[0], t, q, free=free, typical=lengths, by=by, plain=scenes[1:])
+        return near_q, by.closures(by.given(*scenes), t, near_q)[0]
 
-    given = scene, jnp.asarray(t), q, free, usual.closures
+    given = (scene, *usual.plain), jnp.asarray(t), q, free, usual.closures
     if known is None:
         return _by_either(usual, "positions", False, by_xla)(*given)
 
@@ -103,15 +104,14 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
     if usual.program is not None and not usual.program.phi:
         return u, jnp.zeros(0, u.dtype)
 
-    def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
-        near_u = project_speeds(
-            scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by
-        )
-        return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
+    def by_xla(by: RowFunctions, scenes, t, q, u, inputs, free, lengths):
+        how: dict = {"affine": affine, "determined": determined, "by": by, "plain": scenes[1:]}
+        near_u = project_speeds(scenes[0], t, q, u, inputs, free=free, typical=lengths, **how)
+        return near_u, by.rows(by.given(*scenes), t, q, near_u, inputs)[0]
 
     kind = "determined speeds" if determined else "speeds"
     return _by_either(usual, kind, affine or determined, by_xla)(
-        scene, jnp.asarray(t), q, u, inputs, free, usual.rows
+        (scene, *usual.plain), jnp.asarray(t), q, u, inputs, free, usual.rows
     )
 
 
@@ -133,9 +133,9 @@ def _kernel(rows: Rows, given_in: np.dtype):
     return called(lambda w: write(w, rows, cutoff), lambda *_: ((count,),), effort=1)
 
 
-def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
+def _put(rows: Rows, scenes: tuple[Scene, ...], *vectors) -> tuple[Array, Array]:
     """Return the projected quantities and the residual, by machine code."""
-    real, given = real_type(), (*entries(scene, rows.program.parameters), t, *vectors)
+    real, given = real_type(), (*entries(scenes[-1], rows.program.parameters), *vectors)
     found = _kernel(rows, real)(tuple(jnp.asarray(x, real) for x in given))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
 
@@ -165,9 +165,9 @@ def row_functions(program: RowProgram) -> RowFunctions:
     M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
     of_masses = values_of_nodes(program.graph, matrix(M, speeds, speeds), at)
 
-    def parameters_of(scene: Scene):
-        found = entries(scene, program.parameters)
-        return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
+    def parameters_of(*scenes: Scene):
+        each = [entries(scene, program.parameters) for scene in scenes]
+        return tuple(jnp.concatenate(found) if found else jnp.zeros(0, real_type()) for found in each)
 
     def numbers_of(given):
         return parameters_of(given) if isinstance(given, Scene) else given
@@ -183,6 +183,6 @@ def row_functions(program: RowProgram) -> RowFunctions:
     def masses_at(given, t, q):
         return of_masses(numbers_of(given), t, q).reshape(speeds, speeds)
 
-    return RowFunctions(
-        closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of
-    )
+    if program.M is None:
+        return RowFunctions(closures_at, rows_at, BY_AUTODIFF.masses)
+    return RowFunctions(closures_at, rows_at, masses_at, parameters_of)

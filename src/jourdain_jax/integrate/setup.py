@@ -182,7 +182,7 @@ class Plain(NamedTuple):
     """Numbers of a motion without derivatives. Those that all samples share have no batch axis."""
 
     times: Times
-    args: tuple  # as in `Begun`, without the vector field and the scene
+    args: tuple  # as in `Begun`, without the vector field
 
 
 class Begun(eqx.Module):

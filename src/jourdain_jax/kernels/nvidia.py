@@ -6,8 +6,6 @@ device on first use and caches the code between processes.
 
 import ctypes
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 import jax
@@ -138,32 +136,20 @@ def text_for(module: str, architecture: str) -> str:
     return machine.emit_assembly(parsed)
 
 
-@contextmanager
-def _in_context() -> Iterator[None]:
-    """Run the enclosed code in the CUDA context of JAX's first device."""
-    context = ctypes.c_void_p()
-    _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), _devices()[0]))
-    _checked(driver().cuCtxPushCurrent_v2(context))
-    try:
-        yield
-    finally:
-        _checked(driver().cuCtxPopCurrent_v2(ctypes.byref(context)))
-
-
 def loaded(text: bytes, name: str) -> Loaded:
-    """Return the kernel called `name` in PTX."""
-    with _in_context():
-        library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
-        _checked(
-            driver().cuLibraryLoadData(
-                ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0
-            )
-        )
-        _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
+    """Return the kernel called `name` in PTX, loaded in the CUDA context of JAX's first device."""
+    library, device, pointer = driver(), _devices()[0], ctypes.c_void_p
+    context = pointer(_said("cuDevicePrimaryCtxRetain", device, found=pointer))
+    _checked(library.cuCtxPushCurrent_v2(context))
+    try:
+        given = ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0
+        module = pointer(_said("cuLibraryLoadData", *given, found=pointer))
+        kernel = pointer(_said("cuLibraryGetKernel", module, name.encode(), found=pointer))
         # numbers of a kernel's attributes: bytes of local memory (3), registers (4)
-        device = _devices()[0]
         sizes = [_said("cuKernelGetAttribute", attribute, kernel, device) for attribute in (3, 4)]
         return Loaded(kernel.value or 0, *sizes)
+    finally:
+        _checked(library.cuCtxPopCurrent_v2(ctypes.byref(context)))
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:

@@ -40,7 +40,6 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases
 from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.plausibility import faults_at
 from jourdain_jax.structure.row_program import row_program
 
@@ -71,8 +70,9 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     plain = _plain(given)
     times, fixed, _ = lanes_first((plain.times, plain.args[3], asked))
     times = with_derivatives_of(lambda _, times: times.clipped, times, setup.times)
-    fixed = with_derivatives_of(lambda _, field, *of: field.fixed(*of), fixed, setup.field, setup.scene)
-    return given, setup.at(times), asked, _begin(setup, timely, given.scene, fixed, plain)
+    of = setup.field, setup.scene, plain.args[1]
+    fixed = with_derivatives_of(lambda _, field, *of: field.fixed(*of), fixed, *of)
+    return given, setup.at(times), asked, _begin(setup, timely, fixed, plain)
 
 
 # These options minimise XLA's compile time and do not affect steps in machine code. Processor time of a first
@@ -115,7 +115,7 @@ def _plain(setup: Setup) -> Plain:
     """Return the numbers of a setup before `_entered` marks them. Shared numbers have no batch axis."""
     setup = stopped(setup)
     fixed = setup.field.fixed(setup.scene)
-    return Plain(setup.times.clipped, (None, None, setup.inputs, fixed, setup.t0))
+    return Plain(setup.times.clipped, (None, setup.scene, setup.inputs, fixed, setup.t0))
 
 
 def _in_contact(setup: Setup) -> Setup:
@@ -138,18 +138,14 @@ def _in_contact(setup: Setup) -> Setup:
 
 
 def _begin(
-    setup: Setup,
-    timely: Flag | np.bool_,
-    shared: Scene | None = None,
-    fixed: tuple | None = None,
-    plain: Plain | None = None,
+    setup: Setup, timely: Flag | np.bool_, fixed: tuple | None = None, plain: Plain | None = None
 ) -> Begun:
-    """Return the start of the integration. `shared`: the scene before `_entered` marks its numbers."""
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
-        start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
+        usual = replace(setup.usual, plain=plain.args[1:2] if plain else ())
+        start = projected(scene, setup.t0, start, setup.inputs(setup.t0), usual)
     args = field, scene, setup.inputs, field.fixed(scene) if fixed is None else fixed, setup.t0
-    code = _code_at_start(setup._replace(scene=scene if shared is None else shared), start, timely)
+    code = _code_at_start(setup._replace(scene=plain.args[1] if plain else scene), start, timely)
     return Begun(code, start, args, field.pack(start.q, start.u), plain)
 
 
@@ -277,7 +273,14 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
         finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
     else:
         nowhere = np.full(len(program.others), jnp.nan)
-        right, finite = value_kernels.are_right(program, scene, *at, nowhere if unneeded else others.ravel())
+        parts = (
+            *value_kernels.entries(scene, program.parameters),
+            *at,
+            nowhere if unneeded else others.ravel(),
+        )
+        given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
+        found = value_kernels.nodes_called(program.graph, program.right, given)(*stopped(parts))
+        right, finite = found > 0
     fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
     code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
     worst = jnp.min(at[-1][len(scene.inputs) - len(scene.switching.contacts) :], initial=0.0)

@@ -260,7 +260,10 @@ def rollout(
         begin = min(first, count - chunk)  # the last chunk overlaps the one before
         piece = jax.block_until_ready(run_some(options, np.arange(begin, begin + chunk)))
         some, treedef = jax.tree.flatten(piece)
-        every = some if chunk == count else _stored(every or _room(some, count), some, begin)
+        if chunk < count:  # stored in place on the device; the first sample stands for the missing ones
+            every = every or [jnp.broadcast_to(x[:1], (count, *x.shape[1:])) for x in some]
+            some = _stored(every, some, begin)
+        every = some
         bar.update(min(chunk, count - first))
     bar.close()
     lanes = jax.tree.unflatten(treedef, every)
@@ -270,12 +273,6 @@ def rollout(
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
         lanes, reruns = lanes_retried(run_some, form, lanes, begun, options, chunk)
     return Rollout(lanes, reruns)
-
-
-@partial(jax.jit, static_argnums=1)
-def _room(some: list[Array], count: int) -> list[Array]:
-    """Return memory for `count` samples on the device of a chunk."""
-    return [jnp.zeros((count, *x.shape[1:]), x.dtype) for x in some]
 
 
 @partial(jax.jit, donate_argnums=0)

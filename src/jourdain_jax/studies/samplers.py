@@ -190,11 +190,7 @@ def normal_quantile(u):
     dd = d * d
     top, bottom = (_polynomial(of, dd, u) for of in _MIDDLE)
     middle, outer = (d + product(d, dd * top / bottom, u)) * _ROOT, y <= _TAIL
-    if isinstance(u, jax.Array):
-        tail = _outer_quantile(jnp.minimum(y, _TAIL), u)
-    else:  # the tails have few entries
-        tail = np.zeros_like(u)
-        tail[outer] = _outer_quantile(y[outer], y[outer])
+    tail = _outer_quantile(xp.minimum(y, _TAIL), u)
     return xp.where(outer, xp.where(upper, tail, -tail), middle)
 
 

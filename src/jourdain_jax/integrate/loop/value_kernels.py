@@ -36,7 +36,7 @@ from jourdain_jax.calculus.derivatives import (
 )
 from jourdain_jax.calculus.markers import entries_of, lanes_of, stopped
 from jourdain_jax.calculus.progress import all_objects_kept
-from jourdain_jax.calculus.reals import Flag, Indices, Scalar, Speeds, real_type
+from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.explicit_steps import off
 from jourdain_jax.integrate.loop.lanes import MachineWriter
 from jourdain_jax.integrate.loop.operands import Operands
@@ -48,7 +48,6 @@ from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.row_program import RowProgram
 
 
 def called(
@@ -207,7 +206,8 @@ def nodes_called(
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
     """Return the same function as `nodes_called`, with derivatives. Nodes that are structurally zero cost
-    nothing.
+    nothing. An argument may be a pair of equal arrays: machine code takes the second, which lanes may share,
+    and derivatives are with respect to the first.
     """
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
@@ -239,50 +239,62 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
             return None
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
-    def linear(back: bool) -> Callable[[tuple, tuple], Array]:
-        """Return the Jacobian-vector product as a function of x and v, or, with `back`, the vector-Jacobian
-        product as a function of x and g. Its derivative along x is machine code if possible.
+    def linear(back: bool) -> Callable[[tuple, tuple, tuple], Array]:
+        """Return the Jacobian-vector product as a function of `plain`, x and v, or, with `back`, the
+        vector-Jacobian product as a function of `plain`, x and g. Its derivative along x is machine code if
+        possible.
         """
 
         def taken(v: tuple) -> tuple:
             return tuple(g[there] for g in v) if back else v
 
         @jax.custom_jvp
-        def first(x: tuple, v: tuple):
+        def first(plain: tuple, x: tuple, v: tuple):
             if (by_graph := derivative(back, 1)) is not None:
-                return by_graph(*x, *taken(v))
-            return jnp.hstack(jax.vjp(by_xla, *x)[1](*v)) if back else jax.jvp(by_xla, x, v)[1]
+                return by_graph(plain, *x, *taken(v))
+            own = partial(by_xla, plain)
+            return jnp.hstack(jax.vjp(own, *x)[1](*v)) if back else jax.jvp(own, x, v)[1]
 
         @partial(first.defjvp, symbolic_zeros=True)
         def rule(at, tangents):
-            (x, v), (dx, dv) = at, (tuple(map(filled, part)) for part in tangents)
-            still, found = all(map(is_zero, tangents[0])), first(x, v)
+            (plain, x, v), (dx, dv) = at, (tuple(map(filled, part)) for part in tangents[1:])
+            still, found = all(map(is_zero, tangents[1])), first(*at)
             second = None if still else derivative(back, 2)
             if not still and second is None:
-                return jax.jvp(first.fun, at, (dx, dv))
-            rates = [] if all(map(is_zero, tangents[1])) else [first(x, dv)]
-            rates += [second(*x, *taken(v), *dx)] if second else []
+                return jax.jvp(partial(first.fun, plain), at[1:], (dx, dv))
+            rates = [] if all(map(is_zero, tangents[2])) else [first(plain, x, dv)]
+            rates += [second(plain, *x, *taken(v), *dx)] if second else []
             return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
 
         return first
 
     along, back = linear(False), linear(True)
 
-    def push(x: tuple, tangents: tuple):
-        v = tuple(jnp.zeros_like(a) if d is None else d for a, d in zip(x, tangents, strict=True))
-        return values(*x), along(x, v)
+    def push(at: tuple, tangents: tuple):
+        plain, *x = at
+        v = tuple(jnp.zeros_like(a) if d is None else d for a, d in zip(x, tangents[1:], strict=True))
+        return values(*at), along(plain, tuple(x), v)
 
-    def pull(perturbed, x: tuple, found, g):
-        parts = jnp.split(back(x, (g,)), np.cumsum([a.size for a in x])[:-1])
-        return tuple(part.reshape(a.shape) for part, a in zip(parts, x, strict=True))
+    def pull(perturbed, at: tuple, found, g):
+        plain, *x = at
+        parts = jnp.split(back(plain, tuple(x), (g,)), np.cumsum([a.size for a in x])[:-1])
+        return plain, *(part.reshape(a.shape) for part, a in zip(parts, x, strict=True))
 
     values = with_rules(by_machine_code, Rules(push, pull))
-    return lambda *parts: values(*(jnp.asarray(x, real_type()) for x in parts))
+
+    def with_plain(*parts):
+        parts = jax.tree.map(lambda x: jnp.asarray(x, real_type()), parts)
+        pairs = [(part[0], part[-1]) if isinstance(part, tuple) else (part, part) for part in parts]
+        x, plain = zip(*pairs, strict=True)
+        return values(stopped(plain), *x)
+
+    return with_plain
 
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Return two functions from parts of x to values of nodes, by XLA and by machine code. Machine code
-    returns only nonzero nodes, because the whole matrix of 32 trailers would not fit on its stack.
+    """Return two functions from parts of x to values of nodes, by XLA and by machine code. Both first take
+    `plain`, the first parts without derivatives, which machine code uses. It returns only nonzero nodes,
+    because the whole matrix of 32 trailers would not fit on its stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
@@ -292,13 +304,13 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
     def placed(found):
         return found if in_order else jnp.append(found, jnp.zeros((), found.dtype))[which]
 
-    def by_xla(*parts):
+    def by_xla(plain, *parts):
         x = jnp.hstack(parts)
         values = run(graph, list(number), dict(zip(variables, x, strict=True)))
         found = [jnp.asarray(value, x.dtype) for value in values]
         return placed(jnp.stack(found) if found else x[:0])
 
-    return by_xla, lambda *parts: placed(kernel(*parts))
+    return by_xla, lambda plain, *parts: placed(kernel(*plain, *parts[len(plain) :]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,17 +327,20 @@ class Beside:
     energies: Callable[..., Array]  # energies at a state, then with `off` applied to it; without derivatives
     at_start: Callable[..., Array]  # `Lowered.at_start`
 
-    def fixed_values(self, scene: Scene) -> tuple[Scalar, ...]:
-        """Return the values of `Lowered.fixed_values`."""
-        parameters = entries(scene, self.needed)
+    def fixed_values(self, *scenes: Scene) -> tuple[Scalar, ...]:
+        """Return the values of `Lowered.fixed_values`. `scenes`: a scene and, if lanes may share its numbers,
+        the same scene without derivatives.
+        """
+        parameters = [*zip(*(entries(scene, self.needed) for scene in scenes), strict=True)]
         if not self.program.fixed or not parameters:  # no fixed values, or none that depends on parameters
-            return self.program.fixed_values(scene)
+            return self.program.fixed_values(scenes[0])
         return entries_of(self.fixed(*parameters))
 
     def speeds_and_pivot(self, plain: tuple, *state) -> tuple[Speeds, Scalar | None]:
         """Return the values of `Lowered.speeds_and_pivot`. `plain`: as in `VectorField.speeds_and_pivot`."""
         found, count = self.numbers(plain, *state[1:]), len(self.program.speeds)
-        u = with_derivatives_of(lambda _, *state: self.speeds(*state), found[:count], *state)
+        pairs = tuple(zip(state[0], plain, strict=True))
+        u = with_derivatives_of(lambda _, *state: self.speeds(*state), found[:count], pairs, *state[1:])
         return u, smallest_pivot(found[count:])
 
 
@@ -353,7 +368,9 @@ def beside(program: Lowered) -> Beside | None:
         program,
         needed,
         values_of_nodes(graph, program.fixed, given),
-        _at_state(program, u, values_of_nodes) if graph.operations(program.z) >= 100 else program.all_speeds,
+        _at_state(program, u, values_of_nodes)
+        if graph.operations(program.z) >= 100
+        else lambda fixed, *others: program.all_speeds([x for x, _ in fixed], *others),
         lambda *state: numbers(*stopped(state)),
         lambda *state: energies(*stopped(state)),
         _at_state(program, program.at_start, values_of_nodes),
@@ -381,13 +398,3 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
             flat = jnp.reshape(jnp.asarray(leaf, real_type()), (-1,))
             found.append(flat if needed.size == flat.shape[0] else flat[needed])
     return found
-
-
-def are_right(program: RowProgram, scene: Scene, t, q, u, inputs, others) -> tuple[Flag, Flag]:
-    """Return whether the parameters, bodies and contacts of a scene are valid, as checked by
-    `parameter_faults` and `faults_at`, and whether the state is finite.
-    """
-    parts = [*entries(scene, program.parameters), t, q, u, inputs, others]
-    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
-    found = nodes_called(program.graph, program.right, given)(*stopped(parts))
-    return found[0] > 0, found[1] > 0

@@ -221,8 +221,8 @@ class VectorField(eqx.Module):
         """Return whether `rates_and_pivots` also computes how close the constraints are to a loss of rank."""
         return False
 
-    def fixed(self, scene: Scene) -> tuple:
-        """Return the part of the rates that depends on parameters only, computed once per motion."""
+    def fixed(self, *scenes: Scene) -> tuple:
+        """Return what depends on parameters only, computed once per motion (`Beside.fixed_values`)."""
         return ()
 
     def now(self, inputs, t):
@@ -344,9 +344,8 @@ class ByProgram(VectorField):
         """Return whether multipliers and projection enforce constraints."""
         return self.projects and bool(self.program.squares)
 
-    def fixed(self, scene: Scene) -> tuple:
-        """Return the values that depend only on parameters."""
-        return (self.native or self.program).fixed_values(scene)
+    def fixed(self, *scenes: Scene) -> tuple:
+        return self.native.fixed_values(*scenes) if self.native else self.program.fixed_values(scenes[0])
 
     def speeds(self, at: Instant) -> Speeds:
         return self.program.all_speeds(*at.of_program)
