@@ -211,33 +211,28 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
     """
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
-    own = cache(lambda: on_its_own(graph, nodes, variables))  # derivatives add nodes to it
 
     @cache
     def derivative(back: bool, order: int) -> Callable[..., Array] | None:
         """Return the derivative as a function of the parts of x, v or g, and w; None if it is too large or
         cannot be compiled to machine code.
         """
-        graph, nodes, variables = own()
-        weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
-        w = [graph.input(f"w {i}", True) for i in range(len(variables))]
+        own, of, by = on_its_own(graph, nodes, variables)  # derivatives add nodes to it
+        weights = [own.input(f"v {i}", True) for i in range(len(there if back else by))]
+        w = [own.input(f"w {i}", True) for i in range(len(by))]
 
         def along(nodes, direction: list[int]) -> list[int]:
-            return derivatives(graph, nodes, dict(zip(variables, direction, strict=True)))
+            return derivatives(own, nodes, dict(zip(by, direction, strict=True)))
 
         try:
-            first = along(nodes, w) if order == 2 else nodes
-            found = (
-                cotangents(graph, [first[i] for i in there], weights, variables)
-                if back
-                else along(first, weights)
-            )
+            first = along(of, w) if order == 2 else of
+            found = cotangents(own, [first[i] for i in there], weights, by) if back else along(first, weights)
         except Unsupported:
             return None
         # limit on operations; machine code of this size takes 2.4 MB of stack and 1 s to compile
-        if unsupported(graph, found) or graph.operations(found) > 70_000:
+        if unsupported(own, found) or own.operations(found) > 70_000:
             return None
-        return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
+        return differentiated_as(*_both(own, found, [*by, *weights, *(w if order == 2 else ())]))
 
     def linear(back: bool) -> Callable[[tuple, tuple, tuple], Array]:
         """Return the Jacobian-vector product as a function of `plain`, x and v, or, with `back`, the
