@@ -333,8 +333,8 @@ def _speeds_on_rows(at: At, number: PerContact) -> Speeds:
 
 def contacts_at_start(at: At) -> Float[Array, "numbers"]:
     """Return the contacts at the start of a motion: the numbers of their modes, the depth (m) of a body below
-    its ground, and coordinates and speeds. Contacts that touch are
-    put on the ground, and impacts have happened.
+    its ground, and coordinates and speeds. Contacts that touch are put on the ground, and impacts have
+    happened.
     """
     gap, w, q, u = at.found.rows.gap, at.w, at.motion.q.array, at.motion.u.array
     touches = gap < TOUCHES

@@ -249,7 +249,8 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
 
 
-# a rule that is never needed: without derivatives, JAX computes at once, by a program that compiles quickly
+# The rule is never used: JAX calls a function with a rule, but without tangents, by its own program, which
+# compiles quickly.
 _found = jax.custom_jvp(compiled_quickly(followed_to))
 _found.defjvp(lambda *_: NotImplemented)
 
