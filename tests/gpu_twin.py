@@ -229,16 +229,15 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, **fails: int
         ("INTERFACE", DRIVER.interface),
     ):
         stream = stream.replace(name, str(ctypes.cast(there, _pointer).value))
-    register, launched, text = (
-        ffi.register,
-        Counter[str](),
-        gpu.handler_text().replace("@handler(", "@served(") + stream,
-    )
+    register, launched, text_of = ffi.register, Counter[str](), gpu.handler_text
+    text = lambda name: text_of(name).replace("@handler(", "@served(") + stream
     jax.clear_caches()
     with (
         mock.patch.multiple(jax, default_backend=lambda: "gpu"),
-        mock.patch.multiple(gpu, _TARGET="jourdain_jax_in_place_of_a_gpu", handler_text=lambda: text),
-        mock.patch.multiple(ffi, register=lambda name, text, platform: register(name, text, "cpu")),
+        mock.patch.multiple(gpu, handler_text=text),
+        mock.patch.multiple(
+            ffi, register=lambda name, text, platform, effort: register(name, text, "cpu", effort)
+        ),
         mock.patch.multiple(
             nvidia,
             reason_against=str,
