@@ -152,13 +152,13 @@ def test_parameters_are_given_once_to_projections_of_a_state_and_to_all_derivati
     bicycle = jj.models.MODELS["whipple-bicycle"]()
     state = jj.start(bicycle, **bicycle.example)
 
-    def end(mass, speed):
+    def end(mass, time, speed):
         start = eqx.tree_at(lambda state: state.u, state, state.u.at[0].set(speed))
-        return jnp.sum(jj.simulate(bicycle.replace(mB=mass), start, ts=[0.1]).u_end)
+        return jnp.sum(jj.simulate(bicycle.replace(mB=mass), start, ts=[time]).u_end)
 
     with gpu_twin.in_place_of_a_gpu():
-        program = jax.jit(jax.vmap(jax.grad(end), (None, 0)))
-        text = program.lower(bicycle.mB, np.linspace(0.1, 0.2, 7)).as_text()
+        program = jax.jit(jax.vmap(jax.grad(end, (0, 1)), (None, None, 0)))
+        text = program.lower(bicycle.mB, 0.1, np.linspace(0.1, 0.2, 7)).as_text()
     calls = re.findall(r"@jourdain_jax_\w+\(.*} : \((tensor<7x.*)\) -> \(.*\)\n", text)
     given = {tuple(map(int, re.findall(r"\d+(?=x)", call))) for call in calls}
     # time, 8 coordinates, 8 speeds and 2 inputs of a lane; 26 of the bicycle's parameters, and sizes: the
@@ -166,6 +166,8 @@ def test_parameters_are_given_once_to_projections_of_a_state_and_to_all_derivati
     assert {(7, 9, 35), (7, 19, 39), (7, 9, 26), (7, 19, 26), (7, 14, 26), (7, 51, 26), (7, 59, 26)} <= given
     # speeds of three states and their derivative: 29 fixed values; the derivative of 110 fixed values
     assert {(7, 3, 14, 29), (7, 3, 22, 29), (7, 110, 26)} <= given
+    # rates at the saved time and at the end: 12 numbers of a lane's state and its time; what all share
+    assert {(7, 1, 13, 112), (7, 13, 112)} <= given
     small = [call for call in given if len(call) < 5]
     assert not [call for call in small if call[-1] == 1]  # none without shared numbers
 

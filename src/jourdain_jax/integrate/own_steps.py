@@ -147,21 +147,25 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
     numbers = jax.lax.stop_gradient
     alone = setup.at(begun.plain.times if begun.plain else numbers(setup.times))
 
-    def moved_start(y0, args) -> Integrated:
-        return mover(args)(y0, args[-1], numbers(args[-1]) - args[-1])
+    def moved_start(y0, args, shared) -> Integrated:
+        return mover(args, shared)(y0, args[-1], numbers(args[-1]) - args[-1])
 
-    y0, args = with_derivatives_of(moved_start, begun.y0, begun.args), (*begun.args[:-1], alone.t0)
+    given = begun.args, begun.shared
+    y0, args = with_derivatives_of(moved_start, begun.y0, *given), (*begun.args[:-1], alone.t0)
     found = run(alone, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, args)))
-    return with_derivatives_of(partial(_moved, mover), found, begun.args, setup.times, alone.ts)
+    return with_derivatives_of(partial(_moved, mover), found, *given, setup.times, alone.ts)
 
 
-def _moved(mover: Callable, found: Solved, args: tuple, times: Times, ts) -> Solved:
-    """Return a motion with derivatives with respect to its times. `ts`: saved times without derivatives."""
+def _moved(mover: Callable, found: Solved, args: tuple, shared: tuple, times: Times, ts) -> Solved:
+    """Return a motion with derivatives with respect to its times. `shared`: as in `Begun`; `ts`: saved times
+    without derivatives.
+    """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, args
     goals, later = times.goals, start - numbers(start)
     passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
     transitions = passed.times(numbers(start), ts, number[:-1], direction)
-    moved = mover((field, scene, in_phases(inputs, transitions, passed.modes, direction), fixed, start))
+    inputs = in_phases(inputs, transitions, passed.modes, direction)
+    moved = mover((field, scene, inputs, fixed, start), shared)
     event = (found.code == result_codes.EVENT) & (found.accepted > 0)
     t_end = numbers(found.t_end)
     by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))

@@ -194,6 +194,11 @@ class Begun(eqx.Module):
     y0: Integrated
     plain: Plain | None = None  # for machine code, which receives shared numbers once
 
+    @property
+    def shared(self) -> tuple:
+        """Return the arguments without derivatives and without unneeded batch axes, if they are known."""
+        return self.plain.args if self.plain else self.args
+
 
 def ends_fit(first, last, t0, t1, eps: float) -> "Flag | bool":
     """Return whether the span is finite and not empty, and encloses the first and the last saved time in its

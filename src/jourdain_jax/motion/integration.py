@@ -156,7 +156,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     direction = jnp.sign(setup.t1 - t0)
     transitions = solved.passed.times(origin, setup.ts, solved.ts, direction)
     inputs = in_phases(inputs, transitions, solved.passed.modes, direction)
-    args, plain = (field, scene, inputs, fixed, origin), begun.plain.args if begun.plain else begun.args
+    args, plain = (field, scene, inputs, fixed, origin), begun.shared
     stores = field.with_work and field.of_inputs
     stored_first = field.stored(scene, t0, start.q, inputs(t0)) if stores else None
     puts_back = field.projects and not integrator.own

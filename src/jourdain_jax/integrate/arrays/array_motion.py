@@ -122,7 +122,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
     return jax.tree.map(lambda x: x.reshape(blocks * at_once, *x.shape[2:])[:count], found)
 
 
-def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
+def mover(args: PyTree, shared: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
     """Return a function of a state, its time t and a shift d, which shifts the state along its rates by d.
     The value of d is zero: it only carries derivatives.
     """
@@ -131,13 +131,13 @@ def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
     def moved_by(y, t, d):
         z, unravel = ravel_pytree((y, t, known))
 
-        def rates(z):
+        def rates(_, z):
             y, t, known = unravel(z)
             found = integrands.rates(
                 t, y, integrands.within(jnp.full_like(t, jnp.inf), eqx.combine(known, others))
             )
             return ravel_pytree((found, jnp.ones_like(t), jax.tree.map(jnp.zeros_like, known)))[0]
 
-        return unravel(moved(rates)(z, d))[0]
+        return unravel(moved(rates)((), z, d))[0]
 
     return moved_by

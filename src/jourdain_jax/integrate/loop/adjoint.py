@@ -33,7 +33,7 @@ from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.reals import Indices, Scalar
@@ -311,42 +311,42 @@ def _pulled(kernel: Callable, start: Start, g, ends, tries) -> Float[Array, "fou
 Unknowns = Float[Array, "z"]
 
 
-def moved(rates: Callable[[Unknowns], Unknowns]) -> Callable[[Unknowns, Scalar], Unknowns]:
-    """Return a function of z and a time d that shifts z along its `rates` by d. The value of d is zero: it
-    only carries derivatives.
+def moved(rates: Callable[[PyTree, Unknowns], Unknowns]) -> Callable[[PyTree, Unknowns, Scalar], Unknowns]:
+    """Return a function of `plain`, z and a time d that shifts z along its `rates`, a function of `plain` and
+    z, by d. The value of d is zero: it only carries derivatives. `plain` has none.
     """
 
     def moving_with_time(slope: Callable) -> Callable:
         @jax.custom_jvp
-        def same(z, d, v):
+        def same(plain, z, d, v):
             return v
 
         @partial(same.defjvp, symbolic_zeros=True)
         def rule(at, tangents):
-            (z, _, v), (_, dd, dv) = at, tangents
-            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(z, v), dd)
+            (plain, z, _, v), (*_, dd, dv) = at, tangents
+            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(plain, z, v), dd)
 
         return same
 
-    along = moving_with_time(lambda z, v: jax.jvp(rates, (z,), (v,))[1])
-    back = moving_with_time(lambda z, g: jax.vjp(rates, z)[1](g)[0])
+    along = moving_with_time(lambda plain, z, v: jax.jvp(partial(rates, plain), (z,), (v,))[1])
+    back = moving_with_time(lambda plain, z, g: jax.vjp(partial(rates, plain), z)[1](g)[0])
 
     def push(arguments, tangents):
-        (z, d), (dz, dd) = arguments, tangents
+        (plain, z, d), (_, dz, dd) = arguments, tangents
         dz = jnp.zeros_like(z) if dz is None else dz
-        return z, along(z, d, dz if dd is None else dz + scaled(rates(z), dd))
+        return z, along(plain, z, d, dz if dd is None else dz + scaled(rates(plain, z), dd))
 
     def pull(perturbed, arguments, found, g):
-        (z, d), (_, varies) = arguments, perturbed
-        g = back(z, d, g)
-        return g, jnp.sum(scaled(rates(z), g)) if varies else None
+        (plain, z, d), (*_, varies) = arguments, perturbed
+        g = back(plain, z, d, g)
+        return plain, g, jnp.sum(scaled(rates(plain, z), g)) if varies else None
 
-    return with_rules(lambda z, d: z, Rules(push, pull))
+    return with_rules(lambda plain, z, d: z, Rules(push, pull))
 
 
-def rates_of_all(form: Form) -> Callable[[Unknowns], Unknowns]:
+def rates_of_all(form: Form) -> Callable[[PyTree, Unknowns], Unknowns]:
     """Return the rates of z, which consists of the state, time, the known numbers, and the slopes of sampled
-    inputs. The rates of known numbers are zero.
+    inputs. The rates of known numbers are zero. `plain`: z in parts, some of which lanes may share.
     """
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
@@ -355,7 +355,8 @@ def rates_of_all(form: Form) -> Callable[[Unknowns], Unknowns]:
     z = [*y, *work, t, *fixed, *inputs, *slopes]
     of_inputs = dict(zip(form.sampled, slopes, strict=True))
     known = [graph.zero] * len(fixed) + [of_inputs.get(i, graph.zero) for i in range(len(inputs))]
-    return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
+    found = values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
+    return lambda plain, z: found((z, plain))
 
 
 @jax.custom_jvp

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.markers import entries_of
+from jourdain_jax.calculus.markers import entries_of, stopped
 from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, real_type
 from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
@@ -136,9 +136,9 @@ def cotangents(
     return back[: form.y], entries_of(back[form.y :])
 
 
-def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
+def mover(args: tuple, shared: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
     """Return a function of a state, its time t and a shift d, which shifts the state along its rates by d.
-    The value of d is zero: it only carries derivatives.
+    The value of d is zero: it only carries derivatives. `shared`: as in `Begun`.
     """
     others, fixed, along_rates = others_of(args[2]), len(form.program.fixed), moved(rates_of_all(form))
 
@@ -150,19 +150,20 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
         for i in form.switched:
             known[fixed + i] = others[i](t)
         z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
-        return Integrated.of(along_rates(z, d)[: form.y], form)
+        plain = [own if x is None else x for own, x in zip(known, known_of(shared), strict=True)]
+        return Integrated.of(along_rates(stopped((y.rows, t, plain, slopes)), z, d)[: form.y], form)
 
     return moved_by
 
 
 def start_of(setup: Setup, begun: Begun) -> Start:
     """Return the arguments of the kernel for a motion."""
-    args, goals = begun.plain.args if begun.plain else begun.args, setup.times.goals
+    args, goals = begun.shared, setup.times.goals
     knots = setup._replace(inputs=args[2]).knots
     # zeros stand for sampled inputs, which the kernel interpolates
     known, plain = (
-        tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in part)
-        for part in (known_of(begun.args), known_of(begun.plain.args) if begun.plain else ())
+        tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(part))
+        for part in (begun.args, args)
     )
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
     samples, control = _samples(args, goals, knots), control_of(setup, knots)

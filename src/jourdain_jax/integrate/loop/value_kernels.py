@@ -206,8 +206,8 @@ def nodes_called(
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
     """Return the same function as `nodes_called`, with derivatives. Nodes that are structurally zero cost
-    nothing. An argument may be a pair of equal arrays: machine code takes the second, which lanes may share,
-    and derivatives are with respect to the first.
+    nothing. An argument may be a pair of equal arrays, the second possibly in several parts: machine code
+    takes the second, whose parts lanes may share, and derivatives are with respect to the first.
     """
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
@@ -305,7 +305,7 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
         found = [jnp.asarray(value, x.dtype) for value in values]
         return placed(jnp.stack(found) if found else x[:0])
 
-    return by_xla, lambda plain, *parts: placed(kernel(*plain, *parts[len(plain) :]))
+    return by_xla, lambda plain, *parts: placed(kernel(*jax.tree.leaves(plain), *parts[len(plain) :]))
 
 
 @dataclass(frozen=True, eq=False)
