@@ -930,12 +930,15 @@ class Braking(jj.Scene):
     friction: float = jj.parameter(0.5)
     coordinates = jj.coordinates("x z pitch turn")
 
+    def placed(self, q, mass, inertia, x, z, angle):
+        """A body at a place of the frame, from the rear contact."""
+        at = jnp.stack([q.x, 0.0, q.z]) + jj.rot_y(q.pitch) @ jnp.stack([x, 0.0, z - self.rear])
+        return jj.RigidBody(mass, jnp.stack([1.0, inertia, 1.0]), at, jj.rot_y(angle))
+
     def bodies(self, t, q):
-        R, hub = jj.rot_y(q.pitch), jnp.stack([q.x, 0.0 * q.x, q.z])
-        I, J = (jnp.stack([1.0, x, 1.0]) for x in (self.inertia, self.turning))
         return {
-            "frame": jj.RigidBody(self.mass, I, hub + R @ jnp.stack([self.x, 0.0, self.z - self.rear]), R),
-            "wheel": jj.RigidBody(self.wheel, J, hub, jj.rot_y(q.turn)),
+            "frame": self.placed(q, self.mass, self.inertia, self.x, self.z, q.pitch),
+            "wheel": self.placed(q, self.wheel, self.turning, 0.0, self.rear, q.turn),
         }
 
     def loads(self, motion):
@@ -950,13 +953,19 @@ class Braking(jj.Scene):
         }
 
 
+def as_one_body(v, names):
+    """Mass, moment of inertia and centre of these parts of a measured bicycle."""
+    parts = {"B": (v["xB"], -v["zB"]), "H": (v["xH"], -v["zH"]), "F": (v["w"], v["rF"])}
+    m, (x, z) = np.array([v[f"m{name}"] for name in names]), np.array([parts[name] for name in names]).T
+    mass, x0, z0 = m.sum(), m @ x / m.sum(), m @ z / m.sum()
+    inertia = sum(v[f"I{name}yy"] for name in names) + m @ ((x - x0) ** 2 + (z - z0) ** 2)
+    return {"mass": mass, "inertia": inertia, "x": x0, "z": z0}
+
+
 def braking(v):
     """Parameters of `Braking` of a measured bicycle, and the friction (w - b)/h beyond which it tips over."""
-    parts = ("B", v["xB"], v["zB"]), ("H", v["xH"], v["zH"]), ("F", v["w"], -v["rF"])
-    m, x, z = np.array([[v[f"m{name}"], x, -z] for name, x, z in parts]).T
-    mass, x0, z0 = m.sum(), m @ x / m.sum(), m @ z / m.sum()
-    inertia = sum(v[f"I{name}yy"] for name, *_ in parts) + m @ ((x - x0) ** 2 + (z - z0) ** 2)
-    own = {"mass": mass, "inertia": inertia, "x": x0, "z": z0, "wheel": v["mR"], "turning": v["IRyy"]}
+    own = as_one_body(v, "BHF") | {"wheel": v["mR"], "turning": v["IRyy"]}
+    mass, x0, z0 = own["mass"], own["x"], own["z"]
     b, h = mass * x0, mass * z0 + v["mR"] * v["rR"]  # times the whole mass
     limit = (v["w"] * (mass + v["mR"]) - b) / h
     return own | {"rear": v["rR"], "front": v["rF"], "base": v["w"]}, limit
@@ -983,6 +992,69 @@ def test_measured_bicycles_brake():
     assert (rear[1::2] == 0).all()
     assert_allclose(pitch[::2], 0.0, atol=1e-12)
     assert (pitch[1::2, 1] > 0.01).all()
+
+
+class OffKerb(Braking):
+    """A bicycle in its plane, whose wheels turn, on a road that ends 0.1 m above the next one."""
+
+    wheels: object = jj.parameter((3.0, 3.0))
+    turns: object = jj.parameter((0.15, 0.15))
+    coordinates = jj.coordinates("x z pitch rear front")
+
+    def bodies(self, t, q):
+        (rear, front), (own, other) = self.wheels, self.turns
+        return {
+            "frame": self.placed(q, self.mass, self.inertia, self.x, self.z, q.pitch),
+            "rear": self.placed(q, rear, own, 0.0, self.rear, q.rear),
+            "front": self.placed(q, front, other, self.base, self.front, q.front),
+        }
+
+    def contacts(self, pose):
+        def wheel(name, radius):
+            """On the upper road and its edge, or on the lower road, whichever is nearer."""
+            centre = pose[name].position
+            arm = centre - jnp.stack([jnp.minimum(centre[0], 0.0), centre[1], 0.1])
+            away = jnp.sqrt(arm @ arm)
+            gap = jnp.minimum(away, centre[2]) - radius
+            n = jnp.where(away < centre[2], arm / away, jnp.array([0.0, 0.0, 1.0]))
+            point = centre - radius * n
+            plane = jj.Plane(point - gap * n, normal=n)
+            return jj.Contact(pose[name], point, plane, "row", distance=gap, friction=self.friction)
+
+        return {"rear": wheel("rear", self.rear), "front": wheel("front", self.front)}
+
+
+def test_measured_bicycles_ride_off_a_kerb():
+    """Each wheel leaves the edge as it comes to it, since v^2/r exceeds its acceleration there. Friction
+    changes speeds but not `p + sum J w/r`; so the speed is the same at the end, and weight times height is
+    lost in impacts and by slip.
+    """
+    values = [measured_bicycle(name).values for name in sorted(shipped_bicycles().keys() - {"Tms"})]
+    found = [
+        as_one_body(v, "BH")
+        | {"wheels": (v["mR"], v["mF"]), "turns": (v["IRyy"], v["IFyy"])}
+        | {"rear": v["rR"], "front": v["rF"], "base": v["w"]}
+        for v in values
+    ]
+    many = {key: jnp.repeat(jnp.array([own[key] for own in found]), 3, axis=0) for key in found[0]}
+    speeds = jnp.tile(jnp.array([3.0, 4.5, 6.0]), len(found))
+
+    def ride(own, v):
+        scene = OffKerb(**own, friction=0.8)
+        start = {"x": -1.4, "z": 0.1 + scene.rear, "x_rate": v}
+        start |= {"rear_rate": v / scene.rear, "front_rate": v / scene.front}
+        motion = jj.simulate(scene, start, ts=[0.3, 0.6, 1.5], rtol=1e-9, atol=1e-9)
+        energies, at_end = motion.energies(), [motion[name][-1] for name in ("x_rate", "z", "pitch")]
+        return motion.result, motion.phases.ts[0], energies, at_end
+
+    result, first, energies, (x_rate, z, pitch) = jax.vmap(ride)(many, speeds)
+    assert result.tolist() == [SUCCESS] * 33
+    assert_allclose(first, (1.4 - many["base"]) / speeds, rtol=1e-12)
+    assert_allclose(x_rate, speeds, rtol=1e-10)
+    assert_allclose([z - many["rear"], pitch], 0.0, atol=1e-14)
+    weight = G * (many["mass"] + jnp.sum(many["wheels"], axis=1))
+    assert_allclose(energies.balance, energies.balance[:, :1] + jnp.zeros(3), rtol=1e-10)
+    assert_allclose((energies.lost - energies.work)[:, -1], 0.1 * weight, rtol=1e-9)
 
 
 def grip_and_lift(own, friction):

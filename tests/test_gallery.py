@@ -168,15 +168,6 @@ def test_driven_wheels_leave_the_angular_momentum_of_a_satellite():
         assert_allclose(values, values[0], atol=1e-9, err_msg=name)
 
 
-def test_a_dropped_coin_loses_what_friction_and_impacts_take():
-    coin = scene_of("coin")
-    motion = jj.simulate(coin, jj.start(coin, **coin.example), t1=0.5)
-    found = jj.diagnose(motion)
-    assert motion.succeeded
-    assert float(jnp.sum(motion.phases.lost)) > 1e-5 > 1e-11 > float(found.energy_drift)
-    assert set(motion.phase("rim").tolist()) == {0, 1, 2}  # flies, rolls, slips
-
-
 def maker():
     """The script that writes the pages."""
     return importlib.import_module("make_gallery")

@@ -252,8 +252,7 @@ def contact_forces(
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))
     spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", accelerations.spare, part), unit[0])
     positions = of_bodies(motion, "position")
-    rolling = {name: contact for name, contact in contacts.items() if contact.friction is None}
-    built_in = normal_forces(rolling, rows.body_names, positions, held, spare, size)
+    built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
     forces = {}
     if scene.switching.contacts:
         found = switching_forces(scene, motion, contact_response(scene, motion))

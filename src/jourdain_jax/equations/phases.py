@@ -14,7 +14,8 @@
     creeps      L_n             e.w_t                        2 s - e.w_t
 
 A phase ends when one of the values in its line falls through zero; the head of the column names the event.
-The event `speed` also ends the motion of a disc or wheel that falls flat.
+The event `speed` also ends the motion of a disc or wheel that falls flat. If forces jump beyond their bounds,
+as at the edge of a kerb, `after` chooses all modes.
 
 The direction of slip e is part of the state, with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e rotated by a right
 angle (`slip_turns`). Errors of w_t across e therefore do not change e. The rate has no limit at rest: below
@@ -268,23 +269,26 @@ def contact_events(at: At) -> dict[str, Scalar]:
 
 def contact_changes(at: At) -> dict[str, Event]:
     """Return the events of the switching contacts by name, each with the state and the modes after it. If
-    speeds jump, all modes come from `after`; otherwise only the mode of the event's contact changes.
+    speeds or forces jump, all modes come from `after`; otherwise only that of the event's contact changes.
     """
     events, names, now = {}, at.scene.switching.contacts, at.motion.u.array
     together = (at.found.rows.gap < SAME) & (at.w[:, 0] < 0)
+    values, size = contact_events(at), jnp.sum(jnp.abs(switching_forces(at.scene, at.motion, at.found)))
     for i, name in enumerate(names):
         number, own = at.number[i], jnp.arange(len(names)) == i
         strikes, stops, e = number == FLIES, number == CREEPS, at.modes.direction[i]
+        rolls, normal, tangent = number == ROLLS, values[f"{name} normal"], values[f"{name} tangent"]
+        breaks = (~strikes & (normal < -ROUND_OFF * size)) | (rolls & (tangent < -ROUND_OFF * size**2))
         met = own | together if at.rows[i].impact == "moreau" else own
-        found = after(at, i, strikes & (at.number == FLIES) & met, own & stops, own & (number == ROLLS))
+        found = after(at, i, strikes & (at.number == FLIES) & met, own & stops, own & rolls & ~breaks)
         ends = PAINLEVE
         if (above := at.above_flat[i]) is not None:
             ends = jnp.where(above < FLAT_BELOW, FLAT, ends)
         faster = _speeds_on_rows(at, at.number.at[i].set(SLIPS))
         for what, jumps, mode, slot, u in (
-            ("normal", strikes, FLIES, jnp.zeros(2), now),
+            ("normal", strikes | breaks, FLIES, jnp.zeros(2), now),
             # at the start of slip the law at rest gives the direction, even if it sticks by round-off
-            ("tangent", stops, CREEPS, jnp.where(number == SLIPS, e, found.direction), now),
+            ("tangent", stops | breaks, CREEPS, jnp.where(number == SLIPS, e, found.direction), now),
             ("speed", False, jnp.where(stops, SLIPS, ends), e, faster),
         ):
             numbers = jnp.where(jumps, found.numbers, at.number.at[i].set(mode))

@@ -206,6 +206,8 @@ def monitored(
         sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
         if form.goes_on:
             sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
+        sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
+        sinks = [x & ~sunk_now for x in sinks]
         again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
         dips = accept & ((share < 1.0) | again)
         share = w.where(again, ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), share)
@@ -218,7 +220,7 @@ def monitored(
         # trials start at the last state before the event; a step over a dip of a value is repeated up to the
         # lowest value
         found, back = locating & ~restarts & w.equal(search.left, 0.0), changes & search.trying
-        over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
+        over = sunk_now | (accept & ~again & any_of(sinks))  # at the start
         shortens = dips | restarts
         stays = back | shortens | over
 
