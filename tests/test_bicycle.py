@@ -669,6 +669,17 @@ def test_derivatives_of_the_speeds_are_those_of_the_formulas():
         assert_allclose(slopes["g"], found / (2 * 9.81), rtol=1e-12)
 
 
+def test_the_work_of_a_batch_is_proportional_to_its_bicycles():
+    """As compiled: XLA rewrites some batches, such as those of convolutions, with work in their square."""
+
+    def operations(count):
+        shapes = [jax.ShapeDtypeStruct((count, *np.shape(x)), float) for x in BENCHMARK]
+        program = jax.jit(jax.vmap(stability_speeds)).lower(*shapes)
+        return program.compile({"xla_backend_optimization_level": 0}).cost_analysis()["flops"]
+
+    assert operations(5000) < 11 * operations(500)
+
+
 def test_a_missing_speed_does_not_spoil_the_derivatives_of_the_others():
     parameters = _parameters("Yellowrev")
 

@@ -207,14 +207,12 @@ class Linearization(Printed, eqx.Module):
         return minimal(self.state_space(outputs), first, outputs is not None)
 
     def _companion(self) -> Float[Array, "modes modes"]:
-        k = len(self.coordinates)
-        if k == 0:
+        if not self.coordinates:
             raise ValueError(
                 "no coordinates are named, so there is no second-order form; give `coordinates` to "
                 "`linearize`, or use `state_eigenvalues`"
             )
-        lower = -jnp.linalg.solve(self.M, jnp.concatenate([self.K, self.C], axis=1))
-        return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
+        return companion(self.M, self.C, self.K)
 
 
 @shown_from_users_lines
@@ -315,6 +313,12 @@ def _about(
     return Linearization(
         **matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f)
     )
+
+
+def companion(M, C, K) -> Float[Array, "modes modes"]:
+    """Return the matrix of the first-order form `d(p, pdot)/dt` of `M pddot + C pdot + K p = 0`."""
+    lower, k = -jnp.linalg.solve(M, jnp.concatenate([K, C], axis=1)), len(M)
+    return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
 
 
 @compiled_quickly

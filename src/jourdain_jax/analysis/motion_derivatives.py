@@ -20,12 +20,12 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Entries, Indices, array_module, real_type
+from jourdain_jax.dynamics.accelerations import reduced_at
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.reductions import Privileged, scaled
+from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
-from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.integrate.loop.value_kernels import nodes_called, values_of_nodes
 from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported
@@ -176,10 +176,10 @@ class ByMatrices:
 
         def instant(x):
             t, q, u, f = x[at.t[0]], x[at.q], x[at.u], x[at.f]
-            equations, rows = equations_and_rows(scene, t, q, u, f)
-            problem = scaled(equations, rows.judged_by(usual_rows(scene)))
-            udot = problem.c * Privileged(self.constant).solve(problem)[0]
-            v = [coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]
+            found, equations, rows = reduced_at(
+                scene, t, q, u, f, Privileged(self.constant), None, usual_rows(scene)
+            )
+            v = [coordinate_rates(scene, t, q, u), found.udot, closure_residual(scene, t, q), rows.phi]
             return jnp.concatenate(v), equations.M
 
         x = jnp.concatenate([t[None], q, u, f])

@@ -21,8 +21,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.verification import Check, check
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, tiny_of
-from jourdain_jax.dynamics.accelerations import reductions
-from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.dynamics.accelerations import by_reduction, reductions
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import (
     coordinate_rates,
@@ -31,9 +30,9 @@ from jourdain_jax.equations.kinematics import (
     partial_velocities,
     pose_at,
 )
-from jourdain_jax.equations.reductions import reduce, row_scale
+from jourdain_jax.equations.reductions import row_scale
 from jourdain_jax.equations.rows import position_rows, velocity_rows
-from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
+from jourdain_jax.equations.virtual_power import equations_and_rows, on_speeds, resultants
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Labels
@@ -169,13 +168,6 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 
 
-def by_reduction(way, scene, t, q, u, equations, rows):
-    """Apply one reduction to shared equations and constraints."""
-    if isinstance(way, GibbsAppell):
-        return way.accelerations(scene, t, q, u, equations, rows)
-    return reduce(way, equations, rows)
-
-
 @eval_numpy
 def _reverse(arguments, point, direction):
     value, pull = jax.vjp(lambda point: _outcome(arguments, point), point)
@@ -258,11 +250,8 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
     for i, slope in zip(stated, dV, strict=True):
         total = resultants(scene, motion, loads=(loads[i],))
         # Q = beta' F + gamma' L + Q_direct
-        Q = (
-            jnp.einsum("bik,bi->k", partial.linear, total.force)
-            + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque)
-            + total.direct
-        )
+        torque = jnp.einsum("bji,bj->bi", turned, total.torque)
+        Q = on_speeds(partial, total.force, torque) + total.direct
         size = largest(Q) + largest(slope) + tiny_of(q)
         values[f"{_name(i, loads[i])}: its potential does not give its force"] = (
             largest(Z.T @ (Q + slope)) / size

@@ -31,11 +31,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.statements import by_reduction, gradient_checks, statement_checks
+from jourdain_jax.analysis.statements import gradient_checks, statement_checks
 from jourdain_jax.analysis.verification import Verification, check
 from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers, Scalar, Speeds, checked_whole, largest, tiny_of
-from jourdain_jax.dynamics.accelerations import bare_accelerations, diagnosed, reductions
+from jourdain_jax.dynamics.accelerations import bare_accelerations, by_reduction, diagnosed, reductions
 from jourdain_jax.dynamics.reactions import newton_residual, power, row_reactions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import (
@@ -53,6 +53,7 @@ from jourdain_jax.equations.virtual_power import (
     energies_at,
     equations_and_rows,
     lagrange_equations,
+    on_speeds,
     speeds_are_rates,
     unconstrained_equations,
 )
@@ -146,11 +147,7 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     )
     reactions = row_reactions(scene, t, q, u, reference, inputs)
     torque = jnp.einsum("bji,sbj->sbi", turned, reactions.torque)
-    by_row = (
-        jnp.einsum("bik,sbi->sk", partial.linear, reactions.force)
-        + jnp.einsum("bik,sbi->sk", partial.angular, torque)
-        + reactions.direct
-    )
+    by_row = on_speeds(partial, reactions.force, torque) + reactions.direct
     energy = lambda t, q, u: sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))
     energy_rate = jax.jvp(
         energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot)

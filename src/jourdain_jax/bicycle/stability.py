@@ -12,11 +12,9 @@ at roots of polynomials in x (omega^2 = b1/b3):
         D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
         D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
 
-All positive roots are found and refined by Newton's method, whose last steps also give derivatives. The
-second polynomial, H, is b4^3 v times the product of all sums of two eigenvalues. As v grows, the real part of
-a complex pair becomes negative where H' b3 > 0, a real eigenvalue becomes positive where b0' b1 < 0, and two
-equal eigenvalues become a complex pair where dp/dv and d2p/ds2 have equal signs. Coefficients are ordered
-from the highest power.
+All positive roots are found and refined by Newton's method, whose last steps also give derivatives. Counts
+of growing modes between neighbouring roots show what changes at a root. Coefficients are ordered from the
+lowest power.
 
 M, C1, K0 and K2 come from the nonlinear model, linearised about upright straight running at rest and at one
 speed. The tests check that C is proportional to v, and that K is affine in v^2.
@@ -42,7 +40,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float, Key, UInt32
 
-from jourdain_jax.analysis.linearize import linearize
+from jourdain_jax.analysis.linearize import companion, linearize
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, violations
 from jourdain_jax.calculus.compilation import compiled_quickly
@@ -95,7 +93,8 @@ def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
     return _matrices({name: jnp.asarray(value) for name, value in values.items()})
 
 
-def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
+@compiled_quickly  # the first call takes 10 s of processor time instead of 23, and the second 6 ms
+def _matrices(values: dict[str, Scalar]) -> BicycleMatrices:
     bicycle = WhippleBicycle.from_values(values)
 
     def at(speed):
@@ -104,10 +103,6 @@ def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
 
     M, C, K = jax.vmap(at)(jnp.array([0.0, _SPEED]))
     return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
-
-
-# with this, the first call takes 10 s of processor time instead of 23, and the second 6 ms
-_matrices = compiled_quickly(_linearised)
 
 
 def eigenvalues(
@@ -119,14 +114,13 @@ def eigenvalues(
     eigenvalues). If real eigenvalues lie on both sides of a complex pair, the lower one is castering, the
     higher one capsize, and the pair is weave. The eigenvalue of a pair with negative frequency comes first.
     """
-    M, C1, K0, K2, g = _as_matrices(M, C1, K0, K2, g)
+    matrices = _as_matrices(M, C1, K0, K2, g)
+    return jax.vmap(lambda v: _name_modes(_eigenvalues(matrices, v)))(jnp.asarray(speeds, matrices.g.dtype))
 
-    def at(v):
-        # d/dt (q, q') = [[0, I], [-M^-1 (g K0 + v^2 K2), -M^-1 v C1]] (q, q')
-        lower = -jnp.linalg.solve(M, jnp.hstack([g * K0 + v**2 * K2, v * C1]))
-        return _name_modes(jnp.linalg.eigvals(jnp.vstack([jnp.eye(2, 4, 2, dtype=lower.dtype), lower])))
 
-    return jax.vmap(at)(jnp.asarray(speeds, g.dtype))
+def _eigenvalues(matrices: BicycleMatrices, v: Scalar) -> Complex[Array, " 4"]:
+    M, C1, K0, K2, g = matrices
+    return jnp.linalg.eigvals(companion(M, v * C1, g * K0 + v**2 * K2))
 
 
 def stability_speeds(
@@ -149,35 +143,36 @@ def stability_speeds(
     return _speeds(matrices, jax.lax.stop_gradient(jnp.asarray(max_speed, matrices.M.dtype)))
 
 
-def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
-    _, b3, _, b1, b0 = _coefficients(matrices)
-    opposite, coincident = _in_speed(matrices)
-    (zeros, is_zero), (opposites, is_opposite), (coincidents, is_coincident) = (
-        _roots(polynomial, top**2) for polynomial in (b0, opposite, coincident)
+@compiled_quickly
+def _speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
+    found = [_roots(polynomial, top**2) for polynomial in _in_speed(matrices)]
+    x, there = map(jnp.concatenate, zip(*found, strict=True))
+    v, kind = jnp.sqrt(jnp.where(there, x, top**2)), np.repeat(range(3), [len(x) for x, _ in found])
+
+    def between(v):
+        """Return the ends of the intervals between speeds, and the eigenvalues within each interval."""
+        ends = jnp.sort(jnp.concatenate([jnp.zeros(1), jax.lax.stop_gradient(v), top[None]]))
+        at = lambda v: _eigenvalues(jax.lax.stop_gradient(matrices), v)
+        return ends, jax.vmap(at)((ends[:-1] + ends[1:]) / 2)
+
+    ends, values = between(v)
+    more_reals, more_pairs = (
+        jnp.diff(jnp.sum((values.real > 0) & of_kind, axis=1))[jnp.searchsorted(ends, v) - 1]
+        for of_kind in (values.imag == 0, values.imag != 0)
     )
-
-    upward = is_zero & (_slope(b0, zeros) * jnp.polyval(b1, zeros) < 0)
-    capsize = jnp.min(zeros, where=upward, initial=jnp.inf)
-    downward = is_opposite & (jnp.polyval(b1, opposites) * b3 > 0) & (_slope(opposite, opposites) * b3 > 0)
-    weave = jnp.argmax(jnp.where(downward, opposites, -jnp.inf))
-    has_weave = downward[weave]
-
-    below = jnp.where(has_weave, opposites[weave], top**2)
-    merges = is_coincident & jax.vmap(lambda x: _merges(matrices, x))(coincidents) & (coincidents < below)
-    last = jnp.argmax(jnp.where(merges, coincidents, -jnp.inf))
-    crossings = jnp.where(jnp.append(is_zero, is_opposite), jnp.append(zeros, opposites), top**2)
-    stable_from, stable_to = _widest_stable_range(matrices, opposite, crossings, top)
+    only = lambda some: jnp.where(there & some, v, jnp.nan)
+    weave = jnp.nanmax(only((kind == 1) & (more_pairs < 0)))
+    ends, values = between(jnp.where(kind < 2, v, top))
+    widths = jnp.where(jnp.all(values.real < -1e-9, axis=1), jnp.diff(ends), 0.0)
+    k, exists = jnp.argmax(widths), jnp.max(widths) > 0
     return StabilitySpeeds(
-        weave_speed=_root_where(has_weave, opposites[weave]),
-        capsize_speed=_root_where(jnp.isfinite(capsize), capsize),
-        double_root_speed=_root_where(merges[last], coincidents[last]),
-        stable_from=stable_from,
-        stable_to=stable_to,
-        stable_range_exists=~jnp.isnan(stable_from),
+        weave_speed=weave,
+        capsize_speed=jnp.nanmin(only((kind == 0) & (more_reals > 0))),
+        double_root_speed=jnp.nanmax(only((kind == 2) & (more_pairs > 0) & ~(v >= weave))),
+        stable_from=jnp.where(exists, ends[k], jnp.nan),
+        stable_to=jnp.where(exists, ends[k + 1], jnp.nan),
+        stable_range_exists=exists,
     )
-
-
-_speeds = compiled_quickly(_stability_speeds)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
@@ -193,53 +188,29 @@ def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
     return BicycleMatrices(*(jnp.asarray(value, real_type()) for value in (M, C1, K0, K2, g)))
 
 
-def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return the coefficients b4, b3, b2(x), b1(x), b0(x), defined in the module docstring."""
-    M, C1, K0, K2, g = matrices
+def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
+    """Return three polynomials in x (defined in the module docstring). They are zero if an eigenvalue is
+    zero, if two eigenvalues sum to zero, and if two coincide.
+    """
+    one, x = np.eye(2, 7)
+    # not `jnp.polymul`: its batch is a convolution with a group for each sample, and on CPUs the work for it
+    # grows with the square of their number
+    places = np.eye(13)[np.add.outer(range(7), range(7)), :7]
+    times = lambda *factors: reduce(lambda a, b: jnp.einsum("i,j,ijk", a, b, places), factors)
 
     def mixed(A, B):  # det(A + B) - det A - det B
-        return A[0, 0] * B[1, 1] + A[1, 1] * B[0, 0] - A[0, 1] * B[1, 0] - A[1, 0] * B[0, 1]
+        of = lambda i, j, k, l: times(A[i, j], B[k, l])
+        return of(0, 0, 1, 1) + of(1, 1, 0, 0) - of(0, 1, 1, 0) - of(1, 0, 0, 1)
 
-    def det(A):
-        return mixed(A, A) / 2
-
-    found = (
-        [det(M)],
-        [mixed(M, C1)],
-        [mixed(M, K2) + det(C1), g * mixed(M, K0)],
-        [mixed(C1, K2), g * mixed(C1, K0)],
-        [det(K2), g * mixed(K0, K2), g**2 * det(K0)],
-    )
-    return tuple(map(jnp.stack, found))
-
-
-def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
-    """Return the coefficients a4, a3, a2, a1, a0 at one speed."""
-    b4, b3, b2, b1, b0 = (jnp.polyval(b, v**2) for b in _coefficients(matrices))
-    return jnp.stack([b4, v * b3, b2, v * b1, b0])
-
-
-def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return two polynomials in x (defined in the module docstring): the first is zero if two eigenvalues sum
-    to zero, the second if two coincide.
-    """
-    b4, b3, b2, b1, b0 = _coefficients(matrices)
-    x = jnp.array([1.0, 0.0], b0.dtype)
-
-    def combined(*terms):
-        """Return the sum of `terms`, each a factor times a product of polynomials."""
-        return reduce(jnp.polyadd, (factor * reduce(jnp.polymul, parts) for factor, *parts in terms))
-
-    opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
-    D0 = combined((1, b2, b2), (-3, x, b3, b1), (12, b4, b0))
-    D1 = combined(
-        (2, b2, b2, b2), (-9, x, b3, b2, b1), (27, x, b3, b3, b0), (27, x, b4, b1, b1), (-72, b4, b2, b0)
-    )
-    return opposite, combined((4, D0, D0, D0), (-1, D1, D1))
-
-
-def _slope(polynomial: Polynomial, x: Array) -> Array:
-    return jax.lax.stop_gradient(jnp.polyval(jnp.polyder(polynomial), x))
+    M, C1, K0, K2 = (A[..., None] for A in matrices[:4])
+    M, C, K = M * one, C1 * one, matrices.g * K0 * one + K2 * x
+    b4, b3, b1, b0 = mixed(M, M) / 2, mixed(M, C), mixed(C, K), mixed(K, K) / 2
+    b2 = mixed(M, K) + times(x, mixed(C, C)) / 2
+    opposite = times(b1, b2, b3) - times(b4, b1, b1) - times(b0, b3, b3)
+    D0 = times(b2, b2) - 3 * times(x, b3, b1) + 12 * times(b4, b0)
+    D1 = 2 * times(b2, b2, b2) - 9 * times(x, b3, b2, b1) - 72 * times(b4, b2, b0)
+    D1 = D1 + 27 * times(x, times(b3, b3, b0) + times(b4, b1, b1))
+    return b0[:3], opposite[:3], 4 * times(D0, D0, D0) - times(D1, D1)
 
 
 def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:
@@ -248,49 +219,13 @@ def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"]
 
     The inverses of the roots are computed, since the leading coefficients may vanish.
     """
-    inverse = jnp.roots(jax.lax.stop_gradient(polynomial)[::-1], strip_zeros=False)
+    inverse = jnp.roots(jax.lax.stop_gradient(polynomial), strip_zeros=False)
     there = (inverse.imag == 0) & (inverse.real * top > 1)
-    x = jnp.where(there, 1 / jnp.where(there, inverse.real, 1.0), 1.0)
+    x, polynomial = jnp.where(there, 1 / jnp.where(there, inverse.real, 1.0), 1.0), polynomial[::-1]
     for _ in range(3):  # each of the last two steps adds one order of derivatives
-        slope = _slope(polynomial, x)
+        slope = jax.lax.stop_gradient(jnp.polyval(jnp.polyder(polynomial), x))
         x = x - jnp.polyval(polynomial, x) / jnp.where(there & (slope != 0), slope, jnp.inf)
     return x, there
-
-
-def _root_where(there, x: Scalar) -> Scalar:
-    """Return the square root of x where `there` is True, else NaN without derivative."""
-    return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
-
-
-def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
-    """Return whether two positive real eigenvalues become a complex pair at a root x as the speed grows."""
-    v = jnp.sqrt(x)
-    fixed = jax.lax.stop_gradient(matrices)
-    coefficients, slopes = jax.jvp(lambda v: _characteristic(fixed, v), (v,), (jnp.ones_like(v),))
-    first = jnp.polyder(coefficients)
-    roots = jnp.roots(first, strip_zeros=False)
-    s = roots[jnp.argmin(jnp.abs(jnp.polyval(coefficients, roots)))].real
-    return (s > 0) & (jnp.polyval(slopes, s) * jnp.polyval(jnp.polyder(first), s) > 0)
-
-
-def _widest_stable_range(
-    matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar
-) -> tuple[Scalar, Scalar]:
-    """Return the ends of the widest interval between neighbouring `crossings` in which all modes decay, or
-    NaN. They have no derivative.
-    """
-    matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
-    ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))
-    middles = (0.5 * (ends[:-1] + ends[1:])) ** 2
-    # Lienard & Chipart: a0, a1, a3, a4 and the third Hurwitz determinant positive.
-    positive = jnp.stack(
-        [jnp.polyval(jnp.atleast_1d(p), middles) for p in (*_coefficients(matrices), opposite)]
-    )
-    stable = jnp.all(jnp.delete(positive, 2, axis=0) > 0, axis=0)
-    widths = jnp.where(stable, ends[1:] - ends[:-1], 0.0)
-    widest = jnp.argmax(widths)
-    exists = widths[widest] > 0
-    return jnp.where(exists, ends[widest], jnp.nan), jnp.where(exists, ends[widest + 1], jnp.nan)
 
 
 class ParameterSamples(eqx.Module):

@@ -235,9 +235,14 @@ def reduced_at(
     rows = rows.judged_by(usual)
     if as_stabilisation(stabilisation) is not None:
         rows = _stabilised(scene, t, q, rows, stabilisation)
-    if isinstance(reduction, GibbsAppell):
-        return reduction.accelerations(scene, t, q, u, equations, rows), equations, rows
-    return reduce(reduction, equations, rows), equations, rows
+    return by_reduction(reduction, scene, t, q, u, equations, rows), equations, rows
+
+
+def by_reduction(way: Reduction | GibbsAppell, scene: Scene, t, q, u, equations, rows) -> Reduced:
+    """Apply one reduction to known equations and constraints."""
+    if isinstance(way, GibbsAppell):
+        return way.accelerations(scene, t, q, u, equations, rows)
+    return reduce(way, equations, rows)
 
 
 def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> ConstraintRows:

@@ -161,7 +161,7 @@ def equations_of(
     """
     partial = instant.by_speeds.bodies
     force, torque = inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
-    h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
+    h = on_speeds(partial, force, torque)
     M = mass_matrix(instant.weights.mass, instant.weights.inertia, partial.linear, partial.angular)
     return UnconstrainedEquations(M, h, _generalized_forces(scene, instant.motion, partial, loads))
 
@@ -214,10 +214,15 @@ def _generalized_forces(
     scene: Scene, motion: Motion, partial: Velocities, loads: tuple[Load, ...] | None = None
 ) -> Speeds:
     total = impressed(scene, motion, loads)
-    return (
-        jnp.einsum("bik,bi->k", partial.linear, total.force)
-        + jnp.einsum("bik,bi->k", partial.angular, total.torque)
-        + total.direct
+    return on_speeds(partial, total.force, total.torque) + total.direct
+
+
+def on_speeds(
+    partial: Velocities, force: Float[Array, "*more bodies 3"], torque: Float[Array, "*more bodies 3"]
+) -> Float[Array, "*more speeds"]:
+    """Return the generalized forces `sum beta' F + gamma' L` of forces and torques (body axes) on bodies."""
+    return jnp.einsum("bik,...bi->...k", partial.linear, force) + jnp.einsum(
+        "bik,...bi->...k", partial.angular, torque
     )
 
 

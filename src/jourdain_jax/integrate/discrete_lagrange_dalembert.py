@@ -31,7 +31,7 @@ from jourdain_jax.calculus.reals import PerRow, Scalar, Speeds, static
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
-from jourdain_jax.equations.virtual_power import energies_at, resultants, speeds_are_rates
+from jourdain_jax.equations.virtual_power import energies_at, on_speeds, resultants, speeds_are_rates
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.integrate.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField
@@ -115,11 +115,7 @@ def _force(scene: Scene, t, q, u, inputs) -> Speeds:
     loads = resultants(scene, motion, conservative=False)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
     torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)  # body axes, as gamma
-    return (
-        jnp.einsum("bik,bi->k", partial.linear, loads.force)
-        + jnp.einsum("bik,bi->k", partial.angular, torque)
-        + loads.direct
-    )
+    return on_speeds(partial, loads.force, torque) + loads.direct
 
 
 class DiscreteLagrangeDAlembert(FixedStepMethod):

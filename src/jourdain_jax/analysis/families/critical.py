@@ -229,6 +229,7 @@ class _Followed(NamedTuple):
     found: Flag
 
 
+@jax.custom_batching.custom_vmap
 def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
     """Return X, the pseudo-inverse of G_X, the ratio of its smallest to its largest pivot, and a code. X is
     NaN unless the code is 0.
@@ -239,9 +240,24 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     not lead to another point. The point is found if the next correction, at the rate of the last two, would
     be below 1e-7.
     """
-    zero, none = jnp.array(0.0), jnp.array(0)
-    start = _Followed(special.X, zero, zero + 1, none, jnp.array(False))
-    found = _to_the_end(special, scene, start)
+
+    def once(at: _Followed) -> _Followed:
+        share = jnp.minimum(at.done + at.step, 1.0)
+        there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
+
+        def corrected(X, _):
+            change = special.correction(there, X, at.X)
+            return X - change, largest(change)
+
+        X, (first, second, third) = jax.lax.scan(corrected, at.X, length=3)
+        good = (first < 1) & (second <= 0.3 * first + 1e-9) & (third <= 0.3 * second + 1e-9)
+        X, done = jnp.where(good, X, at.X), jnp.where(good, share, at.done)
+        step = jnp.where(good, 2 * at.step, at.step / 4)
+        return _Followed(X, done, step, at.tries + 1, good & (share == 1) & (third**2 <= 1e-7 * second))
+
+    goes_on = lambda at: ~at.found & (at.step > 1e-3) & (at.tries < 100)
+    start = _Followed(special.X, jnp.array(0.0), jnp.array(1.0), jnp.array(0), jnp.array(False))
+    found = jax.lax.while_loop(goes_on, once, start)
     X = found.X - special.correction(scene, found.X, found.X)
     change, inverse, condition = special.inverse(scene, X, found.X)
     known = found.found & (largest(change) < 1e-8)
@@ -249,53 +265,19 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
 
 
+@followed_to.def_vmap
+def _in_blocks(count: int, of_samples: list, *batch):
+    """Follow few samples together, because the number of steps differs between them."""
+    moving, fixed = eqx.partition([*batch], of_samples)
+    one = lambda moving: followed_to.fun(*eqx.combine(moving, fixed))
+    found = jax.lax.map(one, moving, batch_size=8)
+    return found, jax.tree.map(lambda _: True, found)
+
+
 # The rule is never used: JAX calls a function with a rule, but without tangents, by its own program, which
 # compiles quickly.
 _found = jax.custom_jvp(compiled_quickly(followed_to))
 _found.defjvp(lambda *_: NotImplemented)
-
-
-def _once(special: Special, scene: Scene, at: _Followed) -> _Followed:
-    share = jnp.minimum(at.done + at.step, 1.0)
-    there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
-
-    def corrected(X, _):
-        change = special.correction(there, X, at.X)
-        return X - change, largest(change)
-
-    X, (first, second, third) = jax.lax.scan(corrected, at.X, length=3)
-    good = (first < 1) & (second <= 0.3 * first + 1e-9) & (third <= 0.3 * second + 1e-9)
-    X, done = jnp.where(good, X, at.X), jnp.where(good, share, at.done)
-    step = jnp.where(good, 2 * at.step, at.step / 4)
-    return _Followed(X, done, step, at.tries + 1, good & (share == 1) & (third**2 <= 1e-7 * second))
-
-
-def _goes_on(at: _Followed) -> Flag:
-    return ~at.found & (at.step > 1e-3) & (at.tries < 100)
-
-
-@jax.custom_batching.custom_vmap
-def _to_the_end(special: Special, scene: Scene, at: _Followed) -> _Followed:
-    return jax.lax.while_loop(_goes_on, lambda at: _once(special, scene, at), at)
-
-
-@_to_the_end.def_vmap
-def _of_a_batch(count: int, in_batched, *batch) -> tuple[_Followed, _Followed]:
-    """Follow all samples of a batch together in the first step, then one after the other, because the number
-    of further steps differs between samples.
-    """
-    own = jax.tree.unflatten(jax.tree.structure(batch), jax.tree.leaves(in_batched))
-    whole = lambda x, own: x if own else jnp.broadcast_to(x, (count, *jnp.shape(x)))
-    special, scene, at = jax.tree.map(whole, batch, own)
-
-    def once(at: _Followed) -> _Followed:
-        k = jnp.argmax(_goes_on(at))
-        new = _once(*jax.tree.map(lambda x: x[k], (special, scene, at)))
-        return jax.tree.map(lambda x, y: x.at[k].set(y), at, new)
-
-    at = jax.vmap(_once)(special, scene, at)
-    at = jax.lax.while_loop(lambda at: jnp.any(_goes_on(at)), once, at)
-    return at, jax.tree.map(lambda x: True, at)
 
 
 @shown_from_users_lines
