@@ -366,7 +366,7 @@ def test_the_scene_of_a_class_that_comes_first_does_not_matter(name):
     draws = np.random.default_rng(sum(map(ord, name)))
     sizes = [np.exp(spread * draws.uniform(-1.0, 1.0, len(leaves))) for spread in (0.0, 0.3, 0.3, 0.8)]
     sources, ends = set(), set()
-    for order in ((1,), (0, 1), (2, 3, 1), (3, 2, 1)):
+    for order in ((1,), (0, 1), (3, 2, 1)):
         treedef = jax.tree.structure(type("Fresh", (type(usual),), {})(**given))
         for k in order:  # a class of which nothing is known yet
             scene = jax.tree.unflatten(treedef, [f * x for f, x in zip(sizes[k], leaves, strict=True)])

@@ -102,9 +102,7 @@ def bounces(e, h, **options):
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
 def test_ten_bounces(backend):
-    """t_10 = sqrt(2 h/g) (1 + 2 (e + ... + e^9)), and its derivatives along e and h together. Reverse mode by
-    XLA is that of modes and jumps below.
-    """
+    """t_10 = sqrt(2 h/g) (1 + 2 (e + ... + e^9)), and its derivatives along e and h together."""
     time = lambda s: bounces(0.7 + s, 1.0 + s, backend=backend)
     along = lambda f: lambda s: jax.jvp(f, (s,), (1.0,))
     value, by_e, by_e_twice = 2.47360446364125, 8.53571984478680, 41.2871353427762
@@ -116,11 +114,12 @@ def test_ten_bounces(backend):
     def right(found, *orders):
         assert_array_less(np.abs(np.array(jax.tree.leaves(found)) / exact[[*orders]] - 1), close[[*orders]])
 
-    if backend != "xla":
-        right(with_value(jax.grad, time)(0.0), 1, 0)
     if backend != "dense":
-        right(jax.jit(along(along(time)))(0.0), 0, 1, 1, 2)
+        right(with_value(jax.grad, time)(0.0), 1, 0)
+    if backend != "native":
+        right(jax.jit(along(time))(0.0), 0, 1)
     if backend == "native":
+        right(jax.jit(along(along(time)))(0.0), 0, 1, 1, 2)
         right(jax.jit(jax.jacrev(jax.jacfwd(time)))(0.0), 2)
 
 
@@ -146,7 +145,7 @@ def test_a_bounce_without_gravity_turns_the_derivative_round():
 
 
 def test_derivatives_through_modes_and_jumps():
-    """Against differences; both modes of differentiation, and the second order, against each other."""
+    """Against differences and each other; forward over forward mode is that of bounces."""
     motion = switching(NUMBERS)
     assert [motion.event_names[i] for i in motion.phases.events[: int(motion.phases.count)]] == [
         "over",
@@ -157,23 +156,19 @@ def test_derivatives_through_modes_and_jumps():
     beside = NUMBERS + 1e-5 * np.concatenate([np.eye(10), -np.eye(10)])
     weights = np.linspace(0.3, 1.0, 14)
 
-    def total(numbers, **options):
-        found = seen(numbers, **options)
+    def total(numbers):
+        found = seen(numbers)
         return weights @ found, found
 
     def differences(values):
         return np.subtract(*np.split(values, 2)) / 2e-5
 
-    second, forward = with_value(jax.jacfwd, jax.jacfwd(seen))(NUMBERS)
-    hessian = np.tensordot(weights, second, 1)
+    forward = jax.jit(jax.jacfwd(seen))(NUMBERS)
     gradients, values = jax.jit(jax.vmap(jax.grad(total, has_aux=True)))(beside)
     assert_allclose(forward.T, differences(values), rtol=1e-7, atol=1e-8)
+    hessian, gradient = with_value(jax.jacfwd, jax.grad(lambda numbers: total(numbers)[0]))(NUMBERS)
     assert_allclose(hessian, differences(gradients), rtol=1e-6, atol=1e-6)
-    by_arrays, _ = jax.jit(jax.grad(lambda numbers: total(numbers, backend="xla"), has_aux=True))(NUMBERS)
-    reverse, gradient = with_value(jax.jacfwd, jax.grad(lambda numbers: total(numbers)[0]))(NUMBERS)
-    assert_allclose(reverse, hessian, rtol=1e-11, atol=1e-11)
-    for backwards in (gradient, by_arrays):
-        assert_allclose(backwards, weights @ forward, rtol=1e-11, atol=1e-12)
+    assert_allclose(gradient, weights @ forward, rtol=1e-11, atol=1e-12)
 
 
 def test_the_loops_agree_and_lanes_are_in_modes_of_their_own():
