@@ -461,6 +461,43 @@ def test_a_coin_with_much_friction_rolls_as_one_that_cannot_slip():
     assert_allclose(free.u[0], kept.u[0], atol=1e-8)
 
 
+def test_small_motions_of_a_coin_with_much_friction_are_those_of_one_that_cannot_slip():
+    """On a circle, which is steady."""
+    rolling, names = RollingCoin(), ("attitude_turn_x", "attitude_turn_y", "attitude_turn_z")
+    start = jj.start(
+        rolling, attitude=(np.cos(0.15), np.sin(0.15), 0.0, 0.0), attitude_omega_y=30.0, near={"z": 0.0115}
+    )
+    right = jj.linearize(rolling, start, names)
+    entries = (*rolling.coordinate_names.entries, *rolling.speed_names.entries)
+    state = dict(zip(entries, [*start.q, *start.u], strict=True))
+    found = jj.linearize(Coin(friction=1e6), state, names)
+    for name in ("A", "M", "C", "K"):
+        right_one = getattr(right, name)
+        assert_allclose(getattr(found, name), right_one, atol=1e-12 * np.abs(right_one).max())
+    assert found.states == right.states
+    flying = jj.linearize(Coin(), state | {"z": 1.0})
+    assert len(flying.states) == 12
+
+
+def test_small_motions_of_a_ball_that_slips():
+    """dv/dt = -mu g w/|w| with the slip w = v + omega x (-R n), and of omega by the same force."""
+    speeds = ["x_rate", "y_rate", "attitude_omega_x", "attitude_omega_y"]
+    found = jj.linearize(Ball(), SLIDING)
+    assert len(found.states) == 11 - 1
+    rows = [found.states.index(name) for name in speeds]
+    W = np.array([[1.0, 0.0, 0.0, -0.0285], [0.0, 1.0, 0.0285, 0.0]])
+    w = W @ [3.0, 0.4, 5.0, -12.0]
+    across = np.eye(2) - np.outer(w, w) / (w @ w)
+    slopes = -0.2 * G * across / np.linalg.norm(w) @ W
+    A = np.asarray(found.A)[np.ix_(rows, rows)]
+    assert_allclose(A[:2], slopes, atol=1e-12)
+    assert_allclose(A[2:], 2.5 / 0.0285 * np.array([slopes[1], -slopes[0]]), atol=1e-9)
+    end = jj.simulate(Ball(), SLIDING, ts=[0.1]).end
+    names = (*Ball.coordinates.names.entries, *end.names[1].entries)
+    same = jj.linearize(Ball(), {name: end[name] for name in names})
+    assert_allclose(jj.linearize(Ball(), end).A, same.A, atol=1e-9)
+
+
 def test_dropped_coins():
     """Energy is lost where an impact or friction takes it; lanes give what each motion gives alone."""
     attitude = np.random.default_rng(0).normal(size=(4, 4))
@@ -513,13 +550,15 @@ def test_bad_contacts():
     ):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
     with pytest.raises(
-        ValueError,
-        match=(
-            "`linearize` supports only rolling contacts and constraints that never slip, "
-            "but `cloth` of `Ball` may slip"
-        ),
+        ValueError, match=("`family` supports only contacts that never slip, but `cloth` of `Ball` may slip")
     ):
-        jj.linearize(Ball(), {"z": 0.0285})
+        jj.family(Ball(), {"z": 0.0285})
+    with pytest.raises(
+        ValueError, match=r"contacts with friction of `Tilted` \(cloth\) must fly, roll or slip"
+    ):
+        jj.linearize(Tilted(friction=0.01, slope=0.5), {"z": 0.0285})
+    with pytest.raises(ValueError, match=r"of `Sled` \(blade, heading_rate\) must fly, roll or slip in a"):
+        jj.steady(Sled(), {})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body starts below the ground" in below.message
 
@@ -613,6 +652,7 @@ class Belt(jj.Scene):
     """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s."""
 
     static: float = jj.parameter(0.4)
+    sliding: float = jj.parameter(0.25)
     coordinates = jj.coordinates("x z")
 
     def bodies(self, t, q):
@@ -622,7 +662,7 @@ class Belt(jj.Scene):
         return (jj.gravity(motion, G), jj.generalized_force(motion, x_rate=-40.0 * motion.q.x))
 
     def contacts(self, pose):
-        law = {"height": "row", "friction": jj.Coulomb(0.25, static=self.static)}
+        law = {"height": "row", "friction": jj.Coulomb(self.sliding, static=self.static)}
         return {"belt": jj.ball_contact(pose["block"], 0.1, ground=jj.Plane(velocity=(0.1, 0.0, 0.0)), **law)}
 
 
@@ -644,6 +684,23 @@ def test_a_block_sticks_and_slips_on_a_belt():
         ),
     ):
         jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)
+
+
+def test_a_block_slips_at_rest_on_its_belt():
+    """Where the spring holds the friction, x = mu N/k; it swings about this place by the spring alone."""
+
+    def still(sliding):
+        return jj.steady(Belt(0.4, sliding), {"z": 0.1, "x": 0.05}).state
+
+    slope, state = jax.jacfwd(still)(0.25), still(0.25)
+    assert_allclose([state["x"], slope.q[0]], [0.25 * G / 40.0, G / 40.0], rtol=1e-12)
+    small = jj.linearize(Belt(), state)
+    assert small.states == ("x", "x_rate")
+    assert_allclose(small.state_eigenvalues().imag, [-np.sqrt(40.0), np.sqrt(40.0)], rtol=1e-12)
+    assert_allclose(small.state_eigenvalues().real, 0.0, atol=1e-12)
+    from_rest = jj.simulate(Belt(), state, ts=[1.0], **FINE)
+    assert_allclose(from_rest.q_end[0], state["x"], rtol=1e-12)
+    assert from_rest.phase("belt")[0] == 2
 
 
 class Kerb(jj.Scene):

@@ -29,16 +29,17 @@ from jourdain_jax.analysis.linear_matrices import (
 )
 from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
+from jourdain_jax.analysis.steady import in_phase
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, holds, is_traced, static
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, warn
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, warn
 from jourdain_jax.scene.coordinates import Labels, as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
@@ -236,7 +237,8 @@ def linearize(
 
     - `state`: a state on the constraints. In a steady motion, only ignorable coordinates change, such as the
       yaw and the spin of a disc, and the matrices are constant. If the state is not steady, the matrices hold
-      only at this instant, and `residual` measures the deviation.
+      only at this instant, and `residual` measures the deviation. Contacts with friction keep the modes of
+      the state, which must be known: those that fly are absent, and friction acts against slip.
     - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is
       independent. A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body
       axes.
@@ -256,10 +258,12 @@ def linearize(
     determine the others. **Warns** (`SensitivityWarning`) if a load has a kink or jumps at the state, as dry
     friction does at rest.
     """
-    built, scene = scene, as_rolling(scene, "linearize")
+    built, scene = scene, as_scene(scene)
     f = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=f)
-    f = f.astype(state.q.dtype)
+    phase, q, f = in_phase(scene, state.t, state.q, state.u, f.astype(state.q.dtype))
+    if phase is not scene:
+        built, scene, state = phase, phase, state_of(phase, state.t, q, state.u)
     _warn_of_loads(scene, state, f)
     coordinates = None if coordinates is None else as_names(coordinates)
     dependent = None if dependent is None else as_names(dependent)

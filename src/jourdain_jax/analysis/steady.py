@@ -41,16 +41,15 @@ from jourdain_jax.calculus.reals import (
     static,
 )
 from jourdain_jax.calculus.roots import smooth_root
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.phases import At, contacts_at_start
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
-from jourdain_jax.scene.arguments import (
-    BuiltFor,
-    as_input_vector,
-    as_rolling,
-    as_time,
-    shown_from_users_lines,
-)
+from jourdain_jax.motion.sensitivity import numbers_where_known
+from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, as_time, shown_from_users_lines
 from jourdain_jax.scene.coordinates import Labels, as_names, check_names
+from jourdain_jax.scene.modes import FLIES, ROLLS, SLIPS, Switching, switched
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -101,7 +100,7 @@ def steady(
     **Arguments**
 
     - `guess`: a `State`, or named values (omitted ones are zero) at time `t0` (s). It may violate the
-      constraints.
+      constraints. Contacts with friction keep the modes of the guess, which must be known.
     - `held`: names of coordinates and speeds that keep the value of the guess; all others are unknown. If
       several steady motions have these values, the result is one near the guess.
     - `moving`: names of the coordinates that may change during the motion; default: those that do not affect
@@ -122,9 +121,12 @@ def steady(
     most_steps = as_options(
         Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED
     ).max_steps
-    built, scene = scene, as_rolling(scene, "steady")
+    built, scene = scene, as_scene(scene)
+    whole = scene
     t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
+    scene, q, f = in_phase(scene, t, q, u, f)
+    built = built if scene is whole else scene
     held, entries = as_names(held), scene.coordinate_names.entries
     names = entries + scene.speed_names.entries
     unknown = f"`{type(scene).__name__}` has no `{{}}` to hold or to move"
@@ -137,7 +139,41 @@ def steady(
     # no equation depends on these coordinates: they keep the value of the guess, so that no step diverges
     idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
-    return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
+    found = _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
+    if scene is whole:
+        return found
+    at = found.state
+    q = jnp.append(at.q, jnp.zeros(len(whole.coordinate_names) - len(at.q)))
+    at = state_of(whole, at.t, q, at.u, at.moved_q, at.moved_u, at.residual)
+    return eqx.tree_at(lambda x: x.state, found, at)
+
+
+def in_phase(scene: Scene, t, q, u, f) -> tuple:
+    """Return the scene with its contacts in the modes of a state, its coordinates and inputs.
+
+        rolls    the constraints of a contact without friction
+        slips    the constraint of its gap, and the load -mu L_n e against the slip
+        flies    no contact
+
+    Raises ValueError if the modes are unknown or end in this state, or if a velocity constraint may slip.
+    """
+    if not (names := scene.switching.contacts):
+        return scene, q, f
+    known = numbers_where_known((scene, t, q, u, f))
+    unclear = known is None or scene.switching.rows
+    modes = () if unclear else tuple(zip(names, _modes(*known).tolist(), strict=False))
+    if not modes or not {FLIES, ROLLS, SLIPS}.issuperset(dict(modes).values()):
+        raise ValueError(
+            f"contacts with friction of `{type(scene).__name__}` ({', '.join(names)}) must fly, roll or slip "
+            "in a known state; velocity constraints that may slip have no steady motion or linearization"
+        )
+    phase = switched(scene, Switching(phase=modes))
+    return phase, q[: len(phase.coordinate_names)], f[: len(phase.inputs)]
+
+
+@eval_numpy
+def _modes(scene: Scene, t, q, u, f):
+    return contacts_at_start(At(scene, motion_at(scene, t, q, u, f)))
 
 
 def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:

@@ -24,11 +24,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import PerContact, PerRow, Scalar
+from jourdain_jax.equations.contact_laws import unit
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.contact.contacts import Contact, Coulomb
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.loads import HeldRow, Load
+from jourdain_jax.scene.modes import SLIPS, switched, switching_of
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import (
@@ -78,7 +80,7 @@ def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
     kept = {
         name: contact
         for name, contact in contacts_of(scene, pose).items()
-        if contact.height == "row" and contact.friction is None
+        if contact.height == "row" and (contact.friction is None or scene.switching.phase)
     }
     return rows | {f"{name} height": contact.gap() for name, contact in kept.items()}
 
@@ -222,6 +224,21 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
         lambda t, q: speeds(t, q, u), (t, q), (jnp.ones_like(t), coordinate_rates(scene, t, q, u))
     )
     return ContactRows(gap, w, A, drift)
+
+
+def in_whole_scene(scene: Scene, motion: Motion) -> tuple[Scene, Motion, PerRow | float]:
+    """Return the scene of a phase without it, its motion, and the shares of contact forces that are loads:
+    friction along slip. All other contact forces are multipliers. Without slip in a phase, return the
+    arguments and 1.
+    """
+    if SLIPS not in dict(phase := scene.switching.phase).values():
+        return scene, motion, 1.0
+    contacts = contacts_of(scene, motion.pose())
+    slips = {name: unit(slip_of(contacts[name], motion)) for name, number in phase if number == SLIPS}
+    whole, numbers = switched(scene, switching_of(scene)), jnp.array([number for _, number in phase])
+    q = jnp.concatenate([motion.q.array, *(slips.get(name, jnp.zeros(2)) for name, _ in phase)])
+    motion = motion_at(whole, motion.t, q, motion.u.array, jnp.append(motion.inputs.array, numbers))
+    return whole, motion, jnp.outer(numbers == SLIPS, jnp.array([0.0, 1.0, 1.0])).ravel()
 
 
 def contact_loads(

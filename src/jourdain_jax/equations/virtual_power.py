@@ -45,6 +45,7 @@ from jourdain_jax.equations.rows import (
     ContactRows,
     contact_loads,
     contact_rows,
+    in_whole_scene,
     switching_rows,
 )
 from jourdain_jax.program.eager import eager_if_concrete
@@ -319,10 +320,12 @@ def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None)
     `found`: the contacts' response, if already known.
     """
     own = loads_of(scene, motion)
+    scene, motion, shares = in_whole_scene(scene, motion)
     if not scene.switching.contacts:
         return own
     found = contact_response(scene, motion) if found is None else found
-    return (*own, *contact_loads(scene, motion, found.rows.A, switching_forces(scene, motion, found)))
+    forces = switching_forces(scene, motion, found) * shares
+    return (*own, *contact_loads(scene, motion, found.rows.A, forces))
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:

@@ -76,20 +76,6 @@ def as_scene(scene) -> Scene:
     )
 
 
-def as_rolling(scene, what: str) -> Scene:
-    """Return `scene`, or the scene of a model. Raises ValueError if a contact or a velocity constraint may
-    slip, which the function named `what` does not support.
-    """
-    scene = as_scene(scene)
-    if scene.switching.contacts:
-        named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
-        raise ValueError(
-            f"`{what}` supports only rolling contacts and constraints that never slip, but {named} of "
-            f"`{type(scene).__name__}` may slip; remove the friction there"
-        )
-    return scene
-
-
 def of_known_numbers(function: F) -> F:
     """Decorate a function of a scene or motion so that it computes with concrete numbers, even inside
     `jit`, `vmap` and derivatives.

@@ -133,6 +133,7 @@ class Switching:
     inputs: Names | None = None
     modes: Modes | None = None
     rows: Labels = ()  # the names of velocity constraints among `contacts`
+    phase: tuple[tuple[str, float], ...] = ()  # in place of `contacts`: those that keep these modes
 
     @property
     def events(self) -> Labels:
@@ -180,6 +181,13 @@ def _words(code: CodeType) -> set[str]:
         else:
             found |= set(constant) if isinstance(constant, tuple) else {constant}
     return found
+
+
+def switched(scene, switching: Switching):
+    """Return a scene with other declarations of its contacts with friction."""
+    scene = jax.tree.unflatten(*jax.tree.flatten(scene)[::-1])
+    object.__setattr__(scene, "switching", switching)
+    return scene
 
 
 @once_per_class

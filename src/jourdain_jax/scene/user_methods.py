@@ -8,6 +8,7 @@ compiled programs.
 from collections.abc import Iterable, Mapping
 from typing import get_args
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -16,7 +17,7 @@ from jourdain_jax.scene.bodies import Body, Visual
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.coordinates import Named, check_names, nearest
 from jourdain_jax.scene.loads import Gravity, HeldRow, JointFriction, Load, held_rows
-from jourdain_jax.scene.modes import Event
+from jourdain_jax.scene.modes import FLIES, ROLLS, Event
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene, state_names
 
@@ -140,7 +141,10 @@ def held_rows_of(scene: Scene, motion: Motion) -> dict[str, HeldRow]:
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
-    """Return the rolling contacts by name."""
+    """Return the contacts by name. In a phase, those that fly are absent, and those that roll have no
+    friction.
+    """
+    phase = dict(scene.switching.phase)
     contacts = _dictionary(scene, "contacts", (pose,), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
         check_kind(
@@ -149,13 +153,17 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
             f"contact `{name}` of `{_name(scene)}`",
             "a `jj.disc_contact(...)` or another contact",
         )
-        if (contact.friction is not None) != (name in scene.switching.contacts):
+        if (contact.friction is not None) != (name in scene.switching.contacts or name in phase):
             raise ValueError(
                 f"contact `{name}` of `{_name(scene)}` gained or lost its friction after the scene was made; "
                 "write `friction=` in `contacts` itself, not in a function that it calls, for every state or "
                 "for none"
             )
-    return contacts
+    return {
+        name: eqx.tree_at(lambda c: c.friction, contact, None) if phase.get(name) == ROLLS else contact
+        for name, contact in contacts.items()
+        if phase.get(name) != FLIES
+    }
 
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:

@@ -19,7 +19,6 @@ from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.scene.arguments import (
     BuiltFor,
     as_input_vector,
-    as_rolling,
     as_scene,
     of_known_numbers,
     shown_from_users_lines,
@@ -276,7 +275,11 @@ def family(
     if isinstance(guess, PeriodicMotion):
         equations = OrbitEquations(scene, guess, varied, held)
     else:
-        as_rolling(scene, "family")
+        if slipping := scene.switching.contacts:
+            raise ValueError(
+                f"`family` supports only contacts that never slip, but `{slipping[0]}` of "
+                f"`{type(scene).__name__}` may slip; remove the friction there"
+            )
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
         scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
         equations = SteadyEquations(
