@@ -153,7 +153,7 @@ def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
 
 def reachable(scene: Scene) -> int:
     """Return the number of coordinates minus the number of quaternion norms, which are always constant."""
-    return len(scene.coordinate_names) - len(scene.coordinates.quaternions)
+    return len(scene.coordinates.default_speeds)
 
 
 def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
@@ -172,7 +172,7 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
             newest = np.array([[first, *rest] for first in generators for rest in newest])
         values, sizes = _brackets(fields, np.tile(x, (len(newest), 1)), newest)
         size = max(size, float(sizes.max()))
-        spanned, chosen = _extended(spanned, values, tolerance * size)
+        spanned, chosen = extended(spanned, values, tolerance * size)
         if not chosen:
             return tuple(dimensions), True
         dimensions.append(len(spanned) - fields.with_time)
@@ -182,7 +182,7 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
     return tuple(dimensions), False
 
 
-def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
+def extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
     """Extend an orthonormal basis by the independent vectors among `values`, largest first. Return the basis
     and the indices of these vectors.
     """

@@ -30,48 +30,35 @@ from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.coordinates import Labels, check_names
+from jourdain_jax.scene.coordinates import Coordinates, Labels, check_names
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.structure.structure import WELL_CONDITIONED, structure_of, usual_rows
 
 
 def perturbed_names(scene: Scene) -> Labels:
-    """Return the names of the perturbations `ds`: the plain coordinates, and for each quaternion three
-    rotations in body axes, such as `attitude_turn_x`, `..._y`, `..._z`.
+    """Return the names of the perturbations `ds`, in the order of the default speeds: the plain coordinates,
+    and for each quaternion three rotations in body axes, such as `attitude_turn_x`, `..._y`, `..._z`.
     """
-    names = list(scene.coordinate_names.entries)
-    for first, _ in reversed(scene.coordinates.quaternions):
-        group = names[first].removesuffix("_w")
-        names[first : first + 4] = [f"{group}_turn_{axis}" for axis in "xyz"]
+    speeds = scene.coordinates.default_speeds.entries
+    names = ["_turn_".join(name.rsplit("_omega_", 1)) for name in speeds]
+    for coordinate, speed in scene.coordinates.plain:
+        names[speed] = scene.coordinate_names.entries[coordinate]
     return tuple(names)
 
 
+@eval_numpy
 def perturbations(
-    scene: Scene,
-) -> tuple[
-    Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]
-]:
-    """Return S and B of `dq = E ds` with `E = S + B q`. For plain coordinates E is the identity; for a
-    quaternion `E ds` is half its product with the small rotation ds.
+    coordinates: Coordinates,
+) -> tuple[Float[Entries, "coordinates perturbed"], Float[Entries, "coordinates perturbed coordinates"]]:
+    """Return S and B of `dq = E ds` with `E = S + B q`. Default speeds are rates of the perturbations, so E
+    maps them to coordinate rates: for a quaternion, `E ds` is half its product with the small rotation ds.
 
     For a unit quaternion the inverse of `x -> q x` is its transpose: `ds = (S + 4 B q)' dq`.
     """
-    names, entries = perturbed_names(scene), scene.coordinate_names.entries
-    S = np.array([[float(entry == name) for name in names] for entry in entries])
-    B = np.zeros((*S.shape, len(entries)))
-    for k, (first, _) in enumerate(scene.coordinates.quaternions):
-        own = slice(first, first + 4)
-        B[own, first - k : first - k + 3, own] = _HALF_A_TURN
-    return S, B
-
-
-# q (0, ds)/2 = H q ds, by components w, x, y, z of the product and by axes of the rotation
-_HALF_A_TURN = (  # numerics
-    np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]]
-    * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None]
-    / 2
-)
+    E = jax.jacfwd(coordinates.default_rates, 1)
+    at = jnp.zeros(len(coordinates.names)), jnp.zeros(len(coordinates.default_speeds))
+    return E(*at), jax.jacfwd(E)(*at)
 
 
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
@@ -186,7 +173,7 @@ def dependent_coordinates(
         if G is None
         else (G[None], np.asarray(state.q)[None])
     )
-    S, B = perturbations(scene)
+    S, B = perturbations(scene.coordinates)
     G = G @ np.stack([S + B @ x for x in q[: len(G)]])
     G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), tiny_of(G))
     cutoff = rank_cutoff(G.dtype)
@@ -205,7 +192,7 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     """Return the matrices and scalars of a `Linearization`, by field name."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
-    (S, turned), constant = perturbations(scene), at.udot[chosen]
+    (S, turned), constant = perturbations(scene.coordinates), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
     # derivatives along all perturbations (ds, du, df); T: all perturbations from the independent ones
@@ -269,10 +256,7 @@ def own_rate(scene: Scene, name: str) -> int | None:
     """Return the index of the speed that is the rate of the perturbation `name`; None if the scene defines
     its own speeds.
     """
-    if scene.speeds is not None:
-        return None
-    speed = f"{name}_rate" if name in scene.coordinate_names.entries else name.replace("_turn_", "_omega_")
-    return scene.speed_names.entries.index(speed)
+    return perturbed_names(scene).index(name) if scene.speeds is None else None
 
 
 def _speeds_beside(scene: Scene, y, coordinates: Labels) -> np.ndarray:

@@ -22,7 +22,6 @@ from jourdain_jax.analysis.linear_matrices import (
     dependent_coordinates,
     matrices_of,
     own_rate,
-    perturbations,
     perturbed_names,
     privileged_at,
     privileged_speeds,
@@ -173,11 +172,10 @@ class Linearization(Printed, eqx.Module):
         unknown name.
         """
         scene, state, f = self.about
-        count, (S, turned) = len(self.states), perturbations(scene)
-        n, m = S.shape[1], len(state.u)
+        count, n, m = len(self.states), len(perturbed_names(scene)), len(state.u)
 
         def slope(of, x):
-            dq = (S + turned @ state.q) @ x[:n]
+            dq = scene.coordinates.default_rates(state.q, x[:n])
             at = lambda q, u, f: of(motion_at(scene, state.t, q, u, f))
             return jax.jvp(at, (state.q, state.u, f), (dq, x[n : n + m], x[n + m :]))[1]
 

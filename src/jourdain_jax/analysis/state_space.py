@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.integrability import extended
 from jourdain_jax.calculus.lazy_imports import needed
-from jourdain_jax.calculus.reals import described, rank_cutoff, static
+from jourdain_jax.calculus.reals import described, largest, rank_cutoff, static
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.coordinates import Labels, as_names, check_names
 from jourdain_jax.scene.printing import Printed, matrix
@@ -101,12 +102,12 @@ def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
     """
     A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
     of_coordinates = np.arange(len(A)) < first_speed
-    up, down = (largest_of(A[np.ix_(some, ~some)]) for some in (~of_coordinates, of_coordinates))
+    up, down = (largest(A[np.ix_(some, ~some)]) for some in (~of_coordinates, of_coordinates))
     rate = np.sqrt(up / down) if up and down else 1.0
     size = np.where(of_coordinates, rate, 1.0)
     cutoff = rank_cutoff(A.dtype)
     a, b, c = (
-        np.where(np.abs(x) > cutoff * largest_of(x), x, 0.0)
+        np.where(np.abs(x) > cutoff * largest(x), x, 0.0)
         for x in (size[:, None] * A / size, size[:, None] * B, C / size)
     )
     seen = np.any(c != 0, axis=0) if named else ~of_coordinates
@@ -129,22 +130,14 @@ def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
     return StateSpace(A, B, C, D, states, model.inputs, outputs, model.title)
 
 
-def largest_of(x: np.ndarray) -> float:
-    """Return the largest magnitude, or zero if there are no entries."""
-    return float(np.max(np.abs(x), initial=0.0))
-
-
 def _controllable(
     A: Float[np.ndarray, "n n"], B: Float[np.ndarray, "n inputs"], cutoff: float
 ) -> Float[np.ndarray, "n controllable"]:
     """Return an orthonormal basis of the span of `B, A B, A^2 B, ...`, extended by the new directions of each
     product.
     """
-    basis, new, size = np.zeros((len(A), 0)), B, largest_of(B)
-    while new.size:
-        for _ in range(2):  # twice, for orthogonality to round-off
-            new = new - basis @ (basis.T @ new)
-        directions, sizes, _ = np.linalg.svd(new, full_matrices=False)
-        found = directions[:, sizes > cutoff * size]
-        basis, new, size = np.concatenate([basis, found], axis=1), A @ found, largest_of(A)
-    return basis
+    basis, new, size = np.zeros((0, len(A))), B.T, largest(B)
+    while len(new):
+        basis, chosen = extended(basis, new, cutoff * size)
+        new, size = basis[len(basis) - len(chosen) :] @ A.T, largest(A)
+    return basis.T

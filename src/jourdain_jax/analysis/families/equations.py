@@ -105,6 +105,13 @@ class Motions(ABC):
     start: Vector  # the guess
     held: Int[np.ndarray, "held"]  # indices of unknowns that keep their initial values
 
+    def begin(self, held: Labels) -> None:
+        """Name the unknowns, find their values at the guess, and the places of the `held` ones."""
+        names = {k: name for name, k in self.by_name.items()}
+        self.unknowns = tuple(names[k] for k in self.places)
+        self.start = self.given[self.places] / self.size
+        self.held = np.array([self.index(name) for name in held], int)
+
     def index(self, name: str) -> int:
         """Return the index of the unknown `name`. Raises ValueError, with similar names, if there is none."""
         check_name(
@@ -171,13 +178,11 @@ class SteadyEquations(Motions):
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([self.instant.states[0] - 1 + columns, varied]).astype(int)
-        self.unknowns = (*(names[k] for k in kept), *scene.speed_names.entries, *vary)
         self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
-        self.start = self.given[self.places] / self.size
-        self.held = np.array([self.index(name) for name in held], int)
         self.by_name = dict(
             zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True)
         )
+        self.begin(held)
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
         self.rates = np.concatenate([at.qdot[kept], at.udot[y]])

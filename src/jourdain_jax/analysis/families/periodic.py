@@ -245,11 +245,9 @@ class OrbitEquations(Motions):
         self.given = np.append(np.asarray(orbit.unknowns), [float(getattr(scene, name)) for name in vary])
         self.by_name = {name: k for k, name in enumerate((*pieces, "period", *vary))}
         self.places = np.flatnonzero(np.append(orbit.by.is_unknown, np.ones(len(vary), bool)))
-        self.unknowns = tuple(np.array([*self.by_name], object)[self.places])
         all_sizes = np.append(np.tile(orbit.by.sizes, orbit.by.pieces), np.abs(self.given[len(pieces) :]))
         self.size = np.where(all_sizes == 0, 1.0, all_sizes)[self.places]
-        self.start = self.given[self.places] / self.size
-        self.held = np.array([self.index(name) for name in held], int)
+        self.begin(held)
 
     def __call__(self, z: Vector) -> Look:
         """Return the equations, their derivatives and the multipliers at z."""
