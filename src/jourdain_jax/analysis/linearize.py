@@ -123,7 +123,7 @@ class Linearization(Printed, eqx.Module):
         """Return the roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Distinct roots are
         differentiable.
         """
-        return _roots(self._companion())
+        return sorted_eigenvalues(self._companion())
 
     def modes(self, names: Labels | None = None) -> Modes:
         """Return the modes of the second-order form: `eigenvalues`, and mode shapes in the named coordinates.
@@ -159,7 +159,7 @@ class Linearization(Printed, eqx.Module):
         These often form Jordan blocks and are then sensitive to round-off: an error of 1e-16 may change a
         zero eigenvalue to 1e-8. `eigenvalues` omits them.
         """
-        return _roots(self.A)
+        return sorted_eigenvalues(self.A)
 
     def state_space(self, outputs: Outputs = None) -> StateSpace:
         """Return the model `dx/dt = A x + B f`, `y = C x + D f` with the named outputs y.
@@ -338,7 +338,7 @@ def _largest_one(shapes: Complex[Array, "parts modes"]) -> Complex[Array, "parts
 
 
 @compiled_quickly
-def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
-    """Return eigenvalues by ascending real part."""
+def sorted_eigenvalues(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
+    """Return eigenvalues by ascending real part, then imaginary part."""
     values = jnp.linalg.eigvals(matrix)
     return values[jnp.lexsort((values.imag, values.real))]

@@ -40,7 +40,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float, Key, UInt32
 
-from jourdain_jax.analysis.linearize import companion, linearize
+from jourdain_jax.analysis.linearize import companion, linearize, sorted_eigenvalues
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, violations
 from jourdain_jax.calculus.compilation import compiled_quickly
@@ -120,7 +120,7 @@ def eigenvalues(
 
 def _eigenvalues(matrices: BicycleMatrices, v: Scalar) -> Complex[Array, " 4"]:
     M, C1, K0, K2, g = matrices
-    return jnp.linalg.eigvals(companion(M, v * C1, g * K0 + v**2 * K2))
+    return sorted_eigenvalues(companion(M, v * C1, g * K0 + v**2 * K2))
 
 
 def stability_speeds(
@@ -176,8 +176,7 @@ def _speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
-    """Return eigenvalues in the order castering, capsize, weave, weave, as described in `eigenvalues`."""
-    values = values[jnp.lexsort((values.imag, values.real))]
+    """Return sorted eigenvalues in the order castering, capsize, weave, weave (see `eigenvalues`)."""
     is_pair = values.imag != 0
     pair_between = is_pair[1] & is_pair[2] & ~is_pair[0] & ~is_pair[3]
     return jnp.where(pair_between, values[jnp.array([0, 3, 1, 2])], values)
