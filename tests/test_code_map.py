@@ -15,11 +15,11 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 473_738,
+    "code tokens of src": 473_952,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
     "caches": 50,
-    "named numbers": 297,
+    "named numbers": 296,
     "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,
     "ways: projection of a state onto its constraints": 3,

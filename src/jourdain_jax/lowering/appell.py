@@ -9,11 +9,10 @@
 Constraints that are not eliminated are kept (`multipliers.py`). `partial_velocities.py` computes beta, gamma,
 a_0 and alpha_0 by one of two strategies.
 
-`simplify_contacts` simplifies the responses of switching contacts once, by normal forms; loads, events,
+`simplify_contacts` shortens the responses of switching contacts once, by normal forms; loads, events,
 resets and starts then use the simplified nodes.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -31,21 +30,29 @@ from jourdain_jax.structure.probes import generic_states
 from jourdain_jax.structure.structure import Structure
 from jourdain_jax.structure.trace import TracedScene, VelocityQuantities
 
-MOST_TERMS = (8, 60)  # tuning: term limits to try
+MOST_TERMS = 60  # tuning: maximum number of terms of a normal form of contacts
 
 
-def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Replace `responses` by normal forms. Responses at later states, which are functions of earlier
-    responses, are replaced, too. `forms`: function from a maximum number of terms to normal forms.
+def simplify_contacts(build: "AppellOnGraph") -> None:
+    """Replace `responses` by shorter nodes: rows of contacts are differentiated through body velocities, and
+    normal forms come before the elimination. Responses at later states are functions of earlier ones.
     """
-    g, at = traced.graph, traced.at
+    traced, g, at = build.traced, build.graph, build.traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]
     first, *later = (row[len(state) :] for row in at.responses.tolist())
-    normal = min([first, *(forms(most).all_simplified(first) for most in MOST_TERMS)], key=g.operations)
-    simple = dict(zip(first, normal, strict=True))
+    count, forms = len(at.slip_turns) // 2, build._forms(MOST_TERMS)
+    gaps, w, k = first[:count], first[count : 4 * count], Kinematics(build, forms, {}, None)
+    put, slopes, rates, *_ = k.through_velocities()
+    w[::3] = rates(gaps, at.v, at.turning.tolist(), at.orientation.reshape(-1, 9).tolist())
+    rows = g.substituted([*gaps, *w, *slopes(w), *rates(w)], put)
+    plain = {n: m for n in g.reachable(first) if not g.args[m := forms.simplified(n)]}
+    known = plain | k.cut([(first[: len(rows)], rows)])
+    found = g.substituted(first, known)
+    normal = min(found, forms.all_simplified(found), key=g.operations)
+    simple = put | k.cut([(first, normal)])
     for row, nodes in zip(at.responses[1:, : len(state)].tolist(), later, strict=True):
         now = dict(zip(state, g.substituted(row, simple), strict=True))
-        simple |= dict(zip(nodes, g.substituted(normal, now), strict=True))
+        simple |= k.cut([(nodes, g.substituted(normal, now))])
     loads = at.force, at.torque, at.direct, at.power
     for x in (*loads, at.events, at.resets, at.slip_turns, at.held, at.start):
         x[...] = np.array(g.substituted(x.ravel().tolist(), simple), np.int64).reshape(x.shape)
@@ -102,7 +109,7 @@ class AppellOnGraph:
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
         self.reference, self.far, self.identity_probes = reference, far, generic_states(traced, probes)
         if len(traced.at.responses):
-            simplify_contacts(traced, self._forms)
+            simplify_contacts(self)
 
     def build(self, strategy: Strategy) -> Equations:
         """Return the equations, built by the given strategy."""

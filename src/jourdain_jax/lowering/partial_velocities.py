@@ -26,14 +26,15 @@ class Kinematics:
         build,  # the `AppellOnGraph` of the scene
         forms: NormalForms,
         held: dict[int, int],
-        explicit: bool,
+        explicit: bool | None,  # None: neither
         free_z: bool = False,
     ):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
         self._simple = forms.all_simplified
         self.u, self.y = build.traced.u.tolist(), [int(build.traced.u[k]) for k in build.independent]
         self.phi = [int(build.traced.at.phi[s]) for s in build.rows]
-        (self._explicitly if explicit else self._implicitly)()
+        if explicit is not None:
+            (self._explicitly if explicit else self._implicitly)()
 
     # Explicit: substitute the dependent speeds into the velocities, then differentiate.
 
@@ -51,60 +52,12 @@ class Kinematics:
     # velocities.
 
     def _implicitly(self) -> None:
-        g, build, at = self.graph, self.build, self.build.traced.at
-        raw, simple = self._velocities({})
-        qdot = self._at(at.qdot.tolist())
-        by_speed = [self._simple(column) for column in columns(g, simple, self.u)]
-        at_fixed_speeds = self._along(simple, raw, qdot)
-        value = self._parts(simple)
-        rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
-        turn = lambda parts: [self._turned(R, w) for R, w in zip(rotation, parts[1], strict=True)]
-        omega = [
-            self._smaller(direct, turned)
-            for direct, turned in zip([self._at(w.tolist()) for w in at.turning], turn(value), strict=True)
-        ]
-        levels = [
-            (at.v, value[0]),
-            (at.turning, omega),
-            (at.orientation, [np.reshape(R, (3, 3)).tolist() for R in rotation]),
-        ]
-        put = self._cut(levels)
-        self._put = put
-
-        # velocities are replaced for all directions, but change along few of them
-        directions: dict = {
-            None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])
-        }
-        for k, column in enumerate(by_speed):
-            parts = self._parts(column)
-            direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts))])
-            directions[k] = {n: rate for n, rate in direction.items() if rate != g.zero} | {self.u[k]: g.one}
-        A = [
-            [row.get(k, g.zero) for k in range(len(self.u))]
-            for row in directional_derivative(g, self.phi, directions)
-        ]
-        entries = self._at(g.substituted([n for row in A for n in row], put))
-        A = np.reshape(entries, (len(A), len(self.u))).tolist()
-        phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
-        self._solve(A, phi_0)
-        parts = self._parts(at_fixed_speeds)
-        spun = [
-            [
-                [
-                    g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j]))
-                    for j in range(3)
-                ]
-                for i in range(3)
-            ]
-            for w, R in zip(omega, rotation, strict=True)
-        ]
-        direction = self._cut(
-            [(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])]
-        )
-        moving = {int(n): r for n, r in zip(build.traced.q, qdot, strict=True)}
-        drift = self._at(
-            g.substituted(derivatives(g, self.phi, moving | direction | {build.traced.t: g.one}), put)
-        )
+        g, build = self.graph, self.build
+        put, slopes, rates, simple, by_speed, at_fixed_speeds = self.through_velocities()
+        A = self._at(g.substituted(slopes(self.phi), put))
+        A = np.reshape(A, (len(self.phi), len(self.u))).tolist()
+        self._solve(A, self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero))))
+        drift = self._at(g.substituted(rates(self.phi), put))
         put_z = {} if self.free_z else self.known
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
@@ -121,9 +74,58 @@ class Kinematics:
             self._simple([g.add(d, through_z(B, n)) for n, d in enumerate(by_speed[y])])
             for y, B in zip(build.independent, columns_of_B, strict=True)
         ]
-        rates = self._simple([g.add(a, through_z(zdot, n)) for n, a in enumerate(at_fixed_speeds)])
+        along = self._simple([g.add(a, through_z(zdot, n)) for n, a in enumerate(at_fixed_speeds)])
         self._quantities()
-        self._shape(known(simple), partial, rates)
+        self._shape(known(simple), partial, along)
+
+    def through_velocities(self) -> tuple:
+        """Return replacements of traced velocities and orientations by short nodes, functions that
+        differentiate rows with respect to the speeds and along the motion, and the simplified velocities, by
+        speeds and along the motion. The rates are at constant speeds, by default with replaced velocities.
+        """
+        g, traced = self.graph, self.build.traced
+        at, (raw, simple) = traced.at, self._velocities({})
+        qdot = self._at(at.qdot.tolist())
+        by_speed = [self._simple(column) for column in columns(g, simple, self.u)]
+        at_fixed_speeds = self._along(simple, raw, qdot)
+        value = self._parts(simple)
+        rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
+        turn = lambda parts: [self._turned(R, w) for R, w in zip(rotation, parts[1], strict=True)]
+        omega = [
+            self._smaller(direct, turned)
+            for direct, turned in zip([self._at(w.tolist()) for w in at.turning], turn(value), strict=True)
+        ]
+
+        def slopes(rows: NodeList) -> NodeList:
+            # velocities are replaced for all directions, but change along few of them
+            directions: dict = {
+                None: self.cut(
+                    [(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)]
+                )
+            }
+            for k, column in enumerate(by_speed):
+                parts = self._parts(column)
+                direction = self.cut([(at.v, parts[0]), (at.turning, turn(parts))]).items()
+                directions[k] = {n: rate for n, rate in direction if rate != g.zero} | {self.u[k]: g.one}
+            found = directional_derivative(g, rows, directions)
+            return [row.get(k, g.zero) for row in found for k in range(len(self.u))]
+
+        def rates(rows: NodeList, v=value[0], omega=omega, rotation=rotation) -> NodeList:
+            parts = self._parts(at_fixed_speeds)
+            spun = [
+                g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j]))
+                for w, R in zip(omega, rotation, strict=True)
+                for i in range(3)
+                for j in range(3)
+            ]
+            direction = self.cut(
+                [(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, v)]
+            )
+            moving = {int(n): r for n, r in zip(traced.q, qdot, strict=True)}
+            return derivatives(g, rows, moving | direction | {traced.t: g.one})
+
+        put = self.cut([(at.v, value[0]), (at.turning, omega), (at.orientation, rotation)])
+        return put, slopes, rates, simple, by_speed, at_fixed_speeds
 
     def _solve(self, A, phi_0) -> None:
         """Solve `A_z z = -(A_y y + phi_0)` for `z = B y + b`."""
@@ -167,7 +169,7 @@ class Kinematics:
     def _smaller(self, a, b) -> NodeList:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
-    def _cut(self, levels) -> dict[int, int]:
+    def cut(self, levels) -> dict[int, int]:
         """Return replacements for those traced nodes that vary, by node. Values None mean zero."""
         pairs: dict[int, int] = {}
         for nodes, values in levels:
