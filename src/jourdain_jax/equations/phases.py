@@ -113,7 +113,7 @@ class At:
         self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number, self.slots = numbers_and_slots(scene, motion)
-        self.settles = (self.number == FLIES) & (self.slots[:, 1] > 0)
+        self.settles = (self.number == FLIES) & (self.slots[:, 1] == 1)
 
     def then(
         self,
