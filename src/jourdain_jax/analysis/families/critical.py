@@ -269,8 +269,11 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 def _in_blocks(count: int, of_samples: list, *batch):
     """Follow few samples together, because the number of steps differs between them."""
     moving, fixed = eqx.partition([*batch], of_samples)
-    one = lambda moving: followed_to.fun(*eqx.combine(moving, fixed))
-    found = jax.lax.map(one, moving, batch_size=8)
+    # the last sample fills the last block
+    places = np.minimum(np.arange(count + -count % 8), count - 1).reshape(-1, 8)
+    one = lambda k: followed_to.fun(*eqx.combine(jax.tree.map(lambda x: x[k], moving), fixed))
+    found = jax.lax.map(jax.vmap(one), jnp.asarray(places))
+    found = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[:count], found)
     return found, jax.tree.map(lambda _: True, found)
 
 
