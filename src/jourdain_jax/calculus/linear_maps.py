@@ -38,6 +38,8 @@ class LinearMap:
     transposed: Callable[[], "LinearMap"] | None = None
     # (indices) -> derivative with respect to these arrays of `at`; its point is (*at, *arrays); None: by JAX
     along: Callable[[list[int]], Optional["LinearMap"]] = lambda _: None
+    # whether `along` also takes the indices of `arrays`, after those of `at`
+    jointly: bool = False
 
     def __call__(self, at: Sequence, arrays: Sequence) -> list:
         """Return the values of the map."""
@@ -63,14 +65,16 @@ def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
 
 
 def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
-    """Return the forward derivative of a map with respect to some of its first `count` arguments."""
+    """Return the forward derivative of a map with respect to some of its arguments, the first `count` of
+    which are its point.
+    """
 
     def pushed(at, arrays):
-        return jax.jvp(
-            lambda *new: own.apply(put(at[:count], which, new), at[count:]),
-            tuple(at[i] for i in which),
-            tuple(arrays),
-        )[1]
+        def moved(*new):
+            every = put(at, which, new)
+            return own.apply(every[:count], every[count:])
+
+        return jax.jvp(moved, tuple(at[i] for i in which), tuple(arrays))[1]
 
     return LinearMap(pushed, own.shapes)
 
@@ -79,12 +83,12 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
     """Return the map for a batch. `axes`: batch axis of each array of `at`; in the arrays that are mapped it
     comes first.
     """
-    transposed = own.transposed
+    transposed, every = own.transposed, [*axes, *[0] * count]
 
     def along(which: list[int]) -> LinearMap | None:
         further = own.along(which)
         return further and _spread(
-            _in_lanes(further, [*axes, *[0] * count], len(which), size), [axes[i] for i in which], size
+            _in_lanes(further, every, len(which), size), [every[i] for i in which], size
         )
 
     return LinearMap(
@@ -92,6 +96,7 @@ def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
         [jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in own.shapes],
         transposed and (lambda: _in_lanes(transposed(), axes, len(own.shapes), size)),
         along,
+        own.jointly,
     )
 
 
@@ -138,11 +143,13 @@ def _pushed(values, tangents, *, linear: LinearMap, count: int):
     found, along = linear(values[:count], values[count:]), []
     which = [i for i, t in enumerate(tangents[:count]) if type(t) is not ad.Zero]
     if any(type(t) is not ad.Zero for t in tangents[count:]):
-        along.append(linear(values[:count], [ad.instantiate_zeros(t) for t in tangents[count:]]))
+        if which and linear.jointly:  # one call of `apply` in place of two
+            which += range(count, len(values))
+        else:
+            along.append(linear(values[:count], [ad.instantiate_zeros(t) for t in tangents[count:]]))
     if which:
-        along.append(
-            (linear.along(which) or by_jax(linear, count, which))(values, [tangents[i] for i in which])
-        )
+        moving = [ad.instantiate_zeros(tangents[i]) for i in which]
+        along.append((linear.along(which) or by_jax(linear, count, which))(values, moving))
     return found, [reduce(operator.add, parts) for parts in zip(*along, strict=True)]
 
 
@@ -216,6 +223,7 @@ class BothWays(NamedTuple):
             [self.found[i] for i in self.places],
             lambda: self._pulls(moving),
             lambda others: self._turns(moving, others),
+            True,
         )
 
     def _pulls(self, moving: list[int]) -> LinearMap:
@@ -230,19 +238,20 @@ class BothWays(NamedTuple):
         )
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of Jacobian-vector products with respect to other leaves. The derivative also
-        depends on the tangents.
+        """Return the derivative of Jacobian-vector products with respect to other leaves, and to the tangents
+        if indices beyond the results are among the `others`. The derivative also depends on the tangents.
         """
         count = len(self.leaves) + len(self.found)
+        leaves = [i for i in others if i < count]
+        tangents = moving if len(leaves) < len(others) else []
 
         def pulled(at, g):
-            return self._bends(others, moving).apply([*at[:count], *g], at[count:])
+            back = self._bends(leaves, moving).apply([*at[:count], *g], at[count:])
+            return back + (self._pulls(moving).apply(at[:count], g) if tangents else [])
 
         own = by_jax(self.pushes(moving), count, others)
-        return replace(
-            own,
-            transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further),
-        )
+        found = [self.leaves[i] for i in (*leaves, *tangents)]
+        return replace(own, transposed=lambda: LinearMap(pulled, found, lambda: own, no_further))
 
     def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
         """Return the derivative of vector-Jacobian products with respect to other leaves. The derivative also
