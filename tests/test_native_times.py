@@ -99,3 +99,11 @@ def test_second_derivatives_with_respect_to_times_are_differences_of_the_first()
     first, second = jax.jit(jax.grad(weighed)), jax.jit(jax.hessian(weighed))(TIMES)
     differences = [(first(TIMES + step) - first(TIMES - step)) / (2.0 * h) for step in h * np.eye(4)]
     assert_allclose(second, differences, rtol=1e-5, atol=1e-5)
+
+
+def test_third_derivatives_with_respect_to_times_are_refused():
+    def end(x, time):
+        return jj.simulate(Driven(), {"x": x, "x_rate": 0.2}, ts=[time], backend="xla", events=False).q_end[0]
+
+    with pytest.raises(jj.DifferentiationModeError, match="no third derivatives with respect to times"):
+        jax.jacfwd(jax.jacfwd(jax.jacfwd(lambda a: end(a, a))))(0.3)

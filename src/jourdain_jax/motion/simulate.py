@@ -92,7 +92,8 @@ def simulate(
       (default), the first of these that applies. "native" and "xla" take the same steps.
 
     All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in
-    all combinations (`jax.hessian`); other backends support forward mode of forward mode, to any order.
+    all combinations (`jax.hessian`); other backends support forward mode of forward mode, to any order, but
+    with respect to times to second order.
 
     **Returns** a `Trajectory`. A failure sets a result code, whose message advises what to do;
     `trajectory.raise_if_failed()` raises `SimulationError`.

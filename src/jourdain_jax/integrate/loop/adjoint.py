@@ -35,6 +35,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.reals import Indices, Scalar
 from jourdain_jax.integrate import result_codes
@@ -311,6 +312,19 @@ def _pulled(kernel: Callable, start: Start, g, ends, tries) -> Float[Array, "fou
 Unknowns = Float[Array, "z"]
 
 
+@jax.custom_jvp
+def _to_second_order(d: Scalar, dz: Unknowns) -> Unknowns:
+    """Return `dz`, a second derivative, which JAX cannot differentiate with respect to the time d."""
+    return dz
+
+
+@partial(_to_second_order.defjvp, symbolic_zeros=True)
+def _no_third(at, tangents):
+    if not is_zero(tangents[0]):
+        raise DifferentiationModeError("motions have no third derivatives with respect to times")
+    return _to_second_order(*at), filled(tangents[1])
+
+
 def moved(rates: Callable[[PyTree, Unknowns], Unknowns]) -> Callable[[PyTree, Unknowns, Scalar], Unknowns]:
     """Return a function of `plain`, z and a time d that shifts z along its `rates`, a function of `plain` and
     z, by d. The value of d is zero: it only carries derivatives. `plain` has none.
@@ -323,8 +337,9 @@ def moved(rates: Callable[[PyTree, Unknowns], Unknowns]) -> Callable[[PyTree, Un
 
         @partial(same.defjvp, symbolic_zeros=True)
         def rule(at, tangents):
-            (plain, z, _, v), (*_, dd, dv) = at, tangents
-            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(plain, z, v), dd)
+            (plain, z, d, v), (*_, dd, dv) = at, tangents
+            dv = filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(plain, z, v), dd)
+            return same(*at), _to_second_order(d, dv)
 
         return same
 
