@@ -354,7 +354,7 @@ class SleighWithoutDefaults(jj.Scene):
         return {"blade": jj.knife_edge(body, body.place((-self.offset, 0.0, 0.0)), body.orientation[:, 1])}
 
 
-ORDERED = ("snakeboard", "chaplygin-sleigh", "double-pendulum-rods", "spring-and-rod", "pendulum-chain")
+ORDERED = ("snakeboard", "double-pendulum-rods", "spring-and-rod", "pendulum-chain")
 OTHERS = {"car": CarAtItsMiddle(), "sleigh": SleighWithoutDefaults(1.3, 0.25), "gear": Geared()}
 
 

@@ -413,9 +413,8 @@ class Again(jj.Scene):
         }
 
 
-@pytest.mark.parametrize("backend", ["native", "dense"])
-def test_events_count_again_that_another_one_lifts_or_that_were_left_within_one_step(backend):
-    motion = jj.simulate(Again(), {"y": 0.5, "y_rate": -1.0, "z": 50.0}, ts=[11.5], backend=backend)
+def test_events_count_again_that_another_one_lifts_or_that_were_left_within_one_step():
+    motion = jj.simulate(Again(), {"y": 0.5, "y_rate": -1.0, "z": 50.0}, ts=[11.5])
     again = 0.3 + np.sqrt(0.3**2 - 2 * 0.01)
     expected = [0.5, 1.0, 1.05, 10.0, 10.0 + again, 10.0 + 2 * again, np.nan]
     assert_allclose(motion.phases.ts[:7], expected, rtol=1e-9)
@@ -457,7 +456,7 @@ def test_state_and_mode_at_a_saved_time_agree(direction):
     assert set(stopped.tolist()) == {True, False}
 
 
-@pytest.mark.parametrize("backend", ["native", "xla", "dense"])
+@pytest.mark.parametrize("backend", ["native", "xla"])
 def test_work_of_potentials_that_depend_on_modes(backend):
     """What a mode and a jump add to a potential is the event's, not work done between events; x = 1.12 m at
     the event.
