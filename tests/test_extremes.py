@@ -113,6 +113,6 @@ def test_a_motion_that_runs_back_in_time_has_its_end_too():
     motion = jj.simulate(Thrown(), {"z": 0.5, "z_rate": 0.0}, ts=np.linspace(0.0, -1.0, 10), **TIGHT)
     left = -1.0 / 3.0
     assert motion.t_end == pytest.approx(left, abs=1e-9)
-    outputs = LargestMagnitude("z_rate"), Integral("z")
+    outputs = Smallest("z"), LargestMagnitude("z_rate"), Integral("z")
     found = jax.jit(lambda motion: [output.of(motion) for output in outputs])(motion)
-    assert_allclose(found, [3.0, 0.5 * left - 1.5 * left**3], rtol=1e-9, atol=1e-9)
+    assert_allclose(found, [0.0, 3.0, 0.5 * left - 1.5 * left**3], rtol=1e-9, atol=1e-9)

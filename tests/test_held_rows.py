@@ -232,14 +232,16 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
         def rates(t, y, modes=modes):
             return np.concatenate([y[2:], forces(y[:2], y[2:], modes)[1]])
 
-        found = solve_ivp(rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, dense_output=True)
+        found = solve_ivp(
+            rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, dense_output=True, max_step=0.05
+        )
 
         def values(s, modes=modes, found=found):
             z = found.sol(s)
             L, _ = forces(z[:2], z[2:], modes)
             return np.where(modes == 0, F - np.abs(L), modes * z[2:])
 
-        times = np.linspace(t, end, 201)[1:]
+        times = np.linspace(t, end, 601)[1:]
         low = np.array([values(s) for s in times]) < 0
         if not low.any():
             y, t = found.y[:, -1], end

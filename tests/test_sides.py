@@ -231,7 +231,7 @@ def test_on_arrays_values_and_slopes_are_the_same(kind):
         for f in (x, exact)
     )
     for found, right in zip(*(f(at[0]) for f in along), strict=True):
-        assert_allclose(found, right, rtol=0, atol=1e-11)
+        assert_allclose(found, right, rtol=0, atol=1e-12)
 
 
 def test_lanes_are_in_modes_of_their_own():

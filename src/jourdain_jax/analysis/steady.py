@@ -165,7 +165,8 @@ def in_phase(scene: Scene, t, q, u, f) -> tuple:
     if not modes or not {FLIES, ROLLS, SLIPS}.issuperset(dict(modes).values()):
         raise ValueError(
             f"contacts with friction of `{type(scene).__name__}` ({', '.join(names)}) must fly, roll or slip "
-            "in a known state; velocity constraints that may slip have no steady motion or linearization"
+            "in a state whose numbers are known, outside `jit` and `vmap`; velocity constraints that may "
+            "slip are not supported"
         )
     phase = switched(scene, Switching(phase=modes))
     return phase, q[: len(phase.coordinate_names)], f[: len(phase.inputs)]

@@ -227,9 +227,9 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 
 
 def in_whole_scene(scene: Scene, motion: Motion) -> tuple[Scene, Motion, PerRow | float]:
-    """Return the scene of a phase without it, its motion, and the shares of contact forces that are loads:
-    friction along slip. All other contact forces are multipliers. Without slip in a phase, return the
-    arguments and 1.
+    """Return the scene whose contacts may switch, for a scene in a phase, with its motion, and the shares of
+    contact forces that are loads: 1 for friction along slip, 0 for multipliers. If no contact slips in a
+    phase, return the arguments and 1.
     """
     if SLIPS not in dict(phase := scene.switching.phase).values():
         return scene, motion, 1.0

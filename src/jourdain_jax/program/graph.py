@@ -254,7 +254,7 @@ class Graph:
             return self.call("abs", self.args[a][0])
         if op == "select" and args[1] == args[2]:
             return args[1]
-        if op == "eq":  # as in JAX's derivatives; each side of a relation then has its own
+        if op == "eq":  # x == min(x, y), from JAX's derivative of min, is the relation x <= y
             for x, extreme in (args, args[::-1]):
                 is_it = {"min": "le", "max": "ge"}.get(self.op[extreme])
                 if is_it and x in (of := self.args[extreme]):

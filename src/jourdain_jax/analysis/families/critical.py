@@ -277,8 +277,8 @@ def _in_blocks(count: int, of_samples: list, *batch):
     return found, jax.tree.map(lambda _: True, found)
 
 
-# The rule is never used: JAX calls a function with a rule, but without tangents, by its own program, which
-# compiles quickly.
+# Without derivatives, JAX runs `followed_to` as a program of its own, which compiles quickly. The rule is
+# never used.
 _found = jax.custom_jvp(compiled_quickly(followed_to))
 _found.defjvp(lambda *_: NotImplemented)
 

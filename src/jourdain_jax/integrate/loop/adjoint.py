@@ -321,7 +321,10 @@ def _to_second_order(d: Scalar, dz: Unknowns) -> Unknowns:
 @partial(_to_second_order.defjvp, symbolic_zeros=True)
 def _no_third(at, tangents):
     if not is_zero(tangents[0]):
-        raise DifferentiationModeError("motions have no third derivatives with respect to times")
+        raise DifferentiationModeError(
+            "motions have no third derivatives with respect to times; take first or second ones, or higher "
+            "ones at fixed times"
+        )
     return _to_second_order(*at), filled(tangents[1])
 
 

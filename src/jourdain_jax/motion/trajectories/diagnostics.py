@@ -219,7 +219,7 @@ def summary(trajectory: Record, message: str) -> str:
         for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)
     ]
     rows = [
-        ("motion", f"until t {float(trajectory.t_end):.6g} s, {saved}; {message}{lost}"),
+        ("motion", f"until t = {float(trajectory.t_end):.6g} s, {saved}; {message}{lost}"),
         (
             "solver",
             (
