@@ -204,11 +204,17 @@ def monitored(
         fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
         share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
         sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
+        returns = w.literal(0, w.truth)  # a value that may have left zero falls through it within the step
         if form.goes_on:
             sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
+            zero = [w.smaller(c, 0.0) for c in at_begin[0]]
+            _, below = at_start(w, zero, at_begin[1], at_end[0], h, p["direction"], p["last_goal"])
+            returns = fresh & any_of(
+                [(off > 0.0) & x for off, x in zip(p.every("disarmed"), below, strict=True)]
+            )
         sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
         sinks = [x & ~sunk_now for x in sinks]
-        again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
+        again = (any_of(sinks) | returns) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
         dips = accept & ((share < 1.0) | again)
         share = w.where(again, ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), share)
         # the trial passed a second zero of a value that rises from zero: use a shorter step

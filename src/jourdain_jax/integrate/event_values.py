@@ -135,26 +135,28 @@ def may_fall(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values) -
 
 def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
     """Return the fraction of a step `h` at which the first dip below zero between its ends is lowest; 1 if
-    there is no dip. The cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + sqrt(A^2 - 3 B
-    m_0)).
+    there is no dip. With r = sqrt(A^2 - 3 B m_0), the cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at
+    s = -m_0/(A + r) = (r - A)/(3 B).
     """
     shares = []
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
         m_0, A, B = cubic(h, a, slope_a, b, slope_b)
-        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
+        square = A * A - 3.0 * B * m_0
+        r = w.root(w.larger(square, 0.0))
+        s = w.where(A > 0.0, -m_0 / (A + r), (r - A) / (3.0 * B))
         value = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (m_0 < 0.0) & (h * slope_b > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
+        dips = (b > 0.0) & (square > 0.0) & (s > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
         shares.append(w.where(dips, s, 1.0))
     return reduce(w.smaller, shares)
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
-    """Return half of the fraction of a step `h` during which values that rise from zero stay positive, at
-    most one half.
+    """Return half of the fraction of a step `h` during which values that rise from zero stay positive; at
+    least 0.01, at most one half.
     """
     share = w.number(0.5)
     for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
         m, A, B = cubic(h, a, slope_a, b, slope_b)
         back = m / (w.root(w.larger(A * A - 4.0 * B * m, 0.0)) - A)  # half of the root of m + A s + B s^2
         share = w.where(sinking & (back > 0.0) & (back < share), back, share)
-    return share
+    return w.larger(share, 0.01)

@@ -1,0 +1,68 @@
+"""A value that leaves zero without a rate after its event and falls through it again within one step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from test_friction import Coin
+
+import jourdain_jax as jj
+
+
+class Hopper(jj.Scene):
+    """A point that a plate catches at t = 0. The plate falls away and comes back after the time `hop`: their
+    gap is hop^2 (x - y)/(1 + y) with x = (t/hop)^2, y = (t/hop)^power, until they meet.
+    """
+
+    hop: float = jj.parameter(0.03)
+    power: float = jj.parameter(3.0)
+    rate: float = jj.parameter(0.0)  # round-off of the speed after the first event
+    coordinates = jj.coordinates("z")
+
+    def bodies(self, t, q):
+        return {"point": jj.Particle(1.0, [0.0, 0.0, q.z])}
+
+    def events(self, motion):
+        x = (motion.t / self.hop) ** 2
+        fallen = self.hop**2 * (x - x ** (self.power / 2)) / (1 + x ** (self.power / 2))
+        return {"meets": jj.Event(motion.q.z + fallen, jump={"z_rate": 100.0 * motion.t + self.rate})}
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_a_short_hop_ends_at_the_plate(backend):
+    """It ends after `hop` at z = 0, and the state at t = 1 is z = 100 hop (1 - hop)."""
+    powers, hops = jnp.array([2.5, 3.0, 4.0, 6.0, 3.0]), jnp.array([0.03, 0.03, 0.03, 0.03, 0.003])
+
+    def last(power, hop, rate):
+        scene = Hopper(power=power, hop=hop, rate=rate)
+        how = {"backend": backend, "rtol": 1e-9, "atol": 1e-9}
+        motion = jj.simulate(scene, {"z": 0.01, "z_rate": -1.0}, t0=-0.01, ts=[1.0], **how)
+        return motion.phases.ts[:2], motion.q[0, 0]
+
+    rates = jnp.array([-1e-16, 0.0, 1e-16])
+    lanes = [x.ravel() for x in (*(jnp.tile(x, (3, 1)) for x in (powers, hops)), jnp.repeat(rates, 5))]
+    times, z = jax.jit(jax.vmap(last))(*lanes)
+    assert_allclose(times[:, 0], 0.0, atol=1e-12)
+    assert_allclose(times[:, 1], lanes[1], rtol=1e-9)
+    assert_allclose(z, 100 * lanes[1] * (1 - lanes[1]), rtol=1e-8)
+
+
+def test_coins_that_do_not_rebound_stay_above_their_table():
+    """After an impact without rebound, the rim of a turning coin leaves the table at once, often for less
+    than one step.
+    """
+    count, draw = 64, np.random.default_rng(3)
+    attitude = draw.normal(size=(count, 4))
+    attitude /= np.linalg.norm(attitude, axis=1)[:, None]
+    start = {"z": np.full(count, 0.03), "attitude": attitude}
+    start |= {
+        "attitude_omega": draw.uniform(-40.0, 40.0, (count, 3)),
+        "x_rate": draw.uniform(-0.3, 0.3, count),
+    }
+    scene = Coin(bounce=0.0, friction=0.1)
+    coins = jj.rollout(scene, start, ts=np.linspace(0.01, 0.25, 25), rtol=1e-6, atol=1e-6)
+    leans = jax.vmap(jax.vmap(jj.quaternion_to_matrix))(coins["attitude"])[..., 2, 1]
+    gaps = np.asarray(coins["z"] - 0.012 * jnp.sqrt(1.0 - leans**2))
+    assert (np.asarray(coins.result) == 0).sum() > 0.75 * count
+    assert np.nanmin(gaps) > -1e-8
