@@ -27,8 +27,8 @@ CEILINGS = {
     "ways: values and derivatives of constraints, for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
-    "code tokens of tests": 340_306,
-    "code tokens of bench": 108_302,
+    "code tokens of tests": 340_746,
+    "code tokens of bench": 108_346,
     "test files that reach private names": 34,
 }
 

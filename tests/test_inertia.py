@@ -227,21 +227,47 @@ def test_mass_that_leaves_takes_its_momentum_with_it():
 # inertias that no body has.
 
 
-def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
-    generator = np.random.default_rng(0)
-    turns = np.linalg.qr(generator.normal(size=(300, 3, 3)))[0]
-    moments = generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(
-        generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0
-    )
-    moments *= 10.0 ** generator.uniform(-9, 9, (300, 1))
+def turned_inertias(moments, generator):
+    """Inertias with these principal moments about axes at random."""
+    turns = np.linalg.qr(generator.normal(size=(len(moments), 3, 3)))[0]
     inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
+    return (inertias + inertias.mT) / 2
+
+
+@pytest.mark.parametrize("backend", ["native", "dense"])
+def test_an_inertia_is_impossible_where_a_moment_is_negative_or_above_the_sum_of_the_others(backend):
+    generator = np.random.default_rng(0)
+    moments = generator.uniform(0.01, 1.0, size=(300, 3))
+    moments *= np.where(generator.uniform(size=(300, 3)) < 0.15, -1.0, 1.0)
+    flat = abs(moments[:50])
+    flat[:, 2] = flat[:, 0] + flat[:, 1]
+    moments = np.concatenate([moments, flat])
+    least, middle, largest = np.sort(moments, axis=1).T
+    wrong = (least < 0) | (largest > 1.01 * (least + middle))
+    assert 100 < wrong.sum() < 250
+    scales = 10.0 ** generator.uniform(-9, 9, (len(moments), 1))
     lanes = jj.rollout(
         Tumbling(),
         {"attitude_omega_x": 1e-3},
-        parameters={"inertia": (inertias + inertias.mT) / 2},
+        parameters={"inertia": turned_inertias(scales * moments, generator)},
         ts=[1e-6],
+        backend=backend,
     )
-    assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
+    assert_array_equal(lanes.result == results.BAD_PARAMETER, wrong)
+
+
+def test_the_motion_of_a_flat_body_has_derivatives_to_either_side():
+    inertia = turned_inertias(np.array([[0.3, 0.5, 0.8]]), np.random.default_rng(1))[0]
+    along = turned_inertias(np.array([[0.0, 0.0, 1.0]]), np.random.default_rng(2))[0]
+
+    def end(s):
+        start = {"attitude_omega_x": 0.7, "attitude_omega_y": -0.9, "attitude_omega_z": 0.4}
+        motion = jj.simulate(Tumbling(inertia + s * along), start, ts=[1.0], rtol=1e-11, atol=1e-11)
+        return motion.nan_if_failed().u_end
+
+    expected = (end(1e-4) - end(-1e-4)) / 2e-4
+    for slope in (jax.jacfwd(end)(0.0), jax.jacrev(end)(0.0)):
+        assert_allclose(slope, expected, rtol=1e-6, atol=1e-7)
 
 
 class Rolling(jj.Scene):
@@ -319,6 +345,10 @@ WRONG = {  # the code's text in a lane, the text of the error alone
     "moment=-0.3": (
         "a negative moment of inertia: body `wheel`",
         r"moment of inertia of -0\.3 kg m\^2, expected",
+    ),
+    "moment=0.7": (
+        "a moment of inertia above the sum of the others: body `wheel`",
+        r"moments of inertia 0\.3, 0\.3 and 0\.7 kg m\^2, the last above",
     ),
     "stretch=2.0": (
         "an orientation that is no rotation: body `wheel`",

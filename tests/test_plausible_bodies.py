@@ -25,8 +25,9 @@ class Top(jj.Scene):
         return {"top": jj.RigidBody(1.0, inertia, [q.x, 0.0, 0.0], jj.rot_z(q.turn))}
 
 
-def test_a_rod_can_be():
-    assert jj.structure_of(Top(moments=(0.0, 2.0, 2.0))).faults == ()
+@pytest.mark.parametrize("moments", [(0.0, 2.0, 2.0), (0.0, 0.0, 2.0), (1.0, 1.0, 2.0), (1e-3, 2.0, 2.001)])
+def test_rods_plates_and_bodies_with_a_moment_about_one_axis_can_be(moments):
+    assert jj.structure_of(Top(moments=moments)).faults == ()
 
 
 def test_traced_parameters_are_not_judged_by_the_numbers_that_stand_in_for_them():
@@ -140,7 +141,10 @@ class OnLift(OnSledge):
 
 def test_a_check_names_grounds_and_bodies_and_passes_all_models():
     assert "moves with another body" in jj.check(OnSledge()).found["grounds"][0]
-    with pytest.warns(UserWarning, match="Check of Top: LOOK AT THIS"):
-        top = jj.build(Top(moments=(1.0, 1.0, 3.0)))
-    assert "above the sum of the others" in str(jj.verify(top))
+    top = Top(moments=(1.0, 1.0, 3.0))
+    assert "above the sum of the others" in jj.check(top).found["bodies"][0]
+    assert "body `top`: a principal moment of inertia exceeds the sum of the other two" in str(jj.verify(top))
+    for use in (jj.build, jj.report):
+        with pytest.raises(ValueError, match="above the sum of the others"):
+            use(top)
     assert all(jj.check(model()).passed for model in (jj.models.TiltingDisc, jj.models.Suslov))

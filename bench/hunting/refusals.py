@@ -58,6 +58,7 @@ class Block(jj.Scene):
     coordinates = jj.coordinates("x turn")
     above: object = jj.parameter(1.0)  # Ixy, not Iyx
     smallest: object = jj.parameter(1.0)
+    largest: object = jj.parameter(1.0)
     scale: object = jj.parameter(1.0)  # of the orientation
     mirror: object = jj.parameter(1.0)
     down: object = jj.parameter(1.0)  # length of gravity's direction
@@ -66,6 +67,7 @@ class Block(jj.Scene):
         o = 0.0 * q.x
         inertia = jnp.array([[1.0, 0.1, 0.0], [0.1, 1.2, 0.0], [0.0, 0.0, 1.1]])
         inertia = inertia.at[0, 1].add(_beyond(self.above)).at[0, 0].add(-_beyond(self.smallest))
+        inertia = inertia.at[2, 2].add(_beyond(self.largest))
         side = jnp.where(self.mirror > 1e4, -1.0, 1.0)
         turned = (
             (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) @ jnp.diag(jnp.stack([1.0 + o, 1.0 + o, side + o]))
@@ -128,6 +130,7 @@ class TyredWheel(Wheel):
 IMPOSSIBLE = (
     ("inertia that is not symmetric", Block, "above", (0.1, 0.5)),
     ("negative moment", Block, "smallest", (1.1, 2.0)),
+    ("moment above the sum of the others", Block, "largest", (1.2, 2.0)),
     ("scaled orientation", Block, "scale", (0.02, 1.0)),
     ("reflected orientation", Block, "mirror", (0.1, 1.0)),
     ("direction of gravity", Block, "down", (0.02, 2.0)),

@@ -10,7 +10,7 @@ from scipy.special import ellipj, ellipkinc
 
 from .reference import integrate
 
-RUN = {"inertia": (1.0, 2.0, 3.5), "w0": (0.9, 0.4, -0.7), "t_end": 20.0}
+RUN = {"inertia": (1.0, 2.0, 2.9), "w0": (0.9, 0.4, -0.7), "t_end": 20.0}
 
 
 def _parity(order) -> int:

@@ -31,7 +31,8 @@ def from_mjcf(path: FilePath, *, free: Iterable[str] = (), ignore: Iterable[str]
     - `path`: path of the file, or its text.
     - `free`: names of bodies whose position in the parent's frame becomes a parameter.
     - `ignore`: names of elements and attributes to omit although they change the motion, such as "armature"
-      or "equality". With "inertia", impossible moments of inertia are accepted.
+      or "equality". With "inertia", impossible moments of inertia are read; motions refuse them until
+      `replace` gives others.
 
     **Returns** a class. Hinges and slides are coordinates with their names. A ball joint is a quaternion with
     its name; a free joint is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`. Joints without a

@@ -24,8 +24,8 @@ from jourdain_jax.scene.coordinates import (
 )
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.plausibility import ROUNDED
 
-ROUNDED = 0.05  # physics: tolerance, times the largest moment of inertia: some are published with two digits
 POINT = 1e-6**2  # physics, m^2: moments of a smaller squared radius of gyration are round-off
 
 Frame = tuple[Matrix3, Vector3]  # orientation and origin in the inertial frame
@@ -241,7 +241,7 @@ def tree_scene(tree: Tree, source: str, ignore: Labels) -> type[Scene]:
     """Return the class of scenes of a mechanism. Raises ValueError, with the `source`, if nothing moves, a
     moving part has no mass, or moments of inertia are impossible.
 
-    `ignore`: if it contains "inertia", impossible moments are accepted.
+    `ignore`: if it contains "inertia", impossible moments are accepted here, but not by motions.
     """
     moving = tree.moving()
     if not moving:
@@ -357,5 +357,5 @@ def _check_moments(mass: Mass, what: str) -> None:
             "impossible for a body; expected none below zero, and the "
             f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, "
             "units and products of inertia, or give "
-            'ignore=("inertia",) to accept them'
+            'ignore=("inertia",) and replace them'
         )
