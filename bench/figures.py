@@ -10,13 +10,13 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import jax
 
 HERE = Path(__file__).resolve().parent
-Figures = Iterator[dict]  # what a part of a script yields
+sys.path.append(str(HERE.parent / "tests"))  # closed forms, and small scenes
 
 
 def figure(name: str, model: str, value, most: float | None = None, *, least: float | None = None) -> dict:
@@ -25,16 +25,9 @@ def figure(name: str, model: str, value, most: float | None = None, *, least: fl
     """
     value = value.item() if hasattr(value, "item") else value
     bounds = [bound for bound in (least, most) if bound is not None]
-    met = not bounds or (
-        value is not None and (most is None or value <= most) and (least is None or value >= least)
-    )
-    return {
-        "figure": name,
-        "model": model,
-        "value": value,
-        "required": bounds if len(bounds) == 2 else (*bounds, None)[0],
-        "met": met,
-    }
+    required = bounds if len(bounds) == 2 else (*bounds, None)[0]
+    met = value is not None and (most is None or value <= most) and (least is None or value >= least)
+    return {"figure": name, "model": model, "value": value, "required": required, "met": met or not bounds}
 
 
 def main(
@@ -43,13 +36,15 @@ def main(
     *,
     quick: Iterable[str] | None = None,
     out: Path | None = None,
+    drawn: Callable | None = None,
 ) -> None:
     """Measure the parts that are asked for, print every figure as it comes, and write what there is so far;
     exit code 1 where a part raised an error.
 
-    **Arguments:** `parts`, functions by name (or their own names) that take whether to be quick, and the
-    folder of `--out` where `out`, its default, is given, and yield figures; `quick`, the names that `--quick`
-    is left with.
+    **Arguments:** `parts`, functions by name (or their own names) that take whether to be quick (a bool),
+    and the folder of `--out` where `out`, its default, is given, and yield figures; `quick`, the names that
+    `--quick` is left with; `drawn`, where given, takes all figures and that folder instead, also for
+    `--redraw`.
     """
     parts = parts if isinstance(parts, dict) else {part.__name__: part for part in parts}
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -59,12 +54,10 @@ def main(
         "--only", nargs="+", choices=parts, metavar="NAME", help=f"only these: {', '.join(parts)}"
     )
     if out is not None:
-        parser.add_argument(
-            "--out",
-            type=Path,
-            metavar="DIR",
-            help="folder of pictures and tables (default: with --quick a temporary one)",
-        )
+        where = "folder of pictures and tables (default: with --quick a temporary one)"
+        parser.add_argument("--out", type=Path, metavar="DIR", help=where)
+    if drawn:
+        parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: draw this file")
     given, found, more = parser.parse_args(), [], []
     if out is not None:
         more = [given.out or (Path(tempfile.mkdtemp()) if given.quick else out)]
@@ -84,7 +77,10 @@ def main(
         if given.json:
             given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
-    raised = False
+    raised, folder = False, more.pop() if drawn else None
+    if drawn and given.redraw:
+        drawn(json.loads(given.redraw.read_text(encoding="utf-8")), folder)
+        return
     write()
     for name in given.only or (quick if given.quick and quick is not None else parts):
         try:
@@ -93,10 +89,10 @@ def main(
         except Exception as error:
             raised = True
             traceback.print_exc()
-            add(
-                figure(f"{name} raised an error", "", f"{type(error).__name__}: {error}"[:200])
-                | {"met": False}
-            )
+            said = f"{type(error).__name__}: {error}"[:200]
+            add(figure(f"{name} raised an error", "", said) | {"met": False})
+    if drawn:
+        drawn(found, folder)
     sys.exit(raised)
 
 
@@ -115,6 +111,12 @@ def fresh(program: str, *arguments, **environment: str):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def markdown(head: Iterable[str], rows: Iterable[Iterable]) -> list[str]:
+    """Return the lines of a table."""
+    lines = [f"| {' | '.join(map(str, row))} |" for row in (head, *rows)]
+    return [lines[0], "|" + "---|" * len(head), *lines[1:]]
+
+
 def seconds_of(call: Callable, clock: Callable = time.process_time) -> tuple:
     """Return what a call gives, and its seconds (of processor time, unless another clock is given) until all
     of it is there.
@@ -124,7 +126,7 @@ def seconds_of(call: Callable, clock: Callable = time.process_time) -> tuple:
     return found, clock() - begin
 
 
-def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
+def compiled(function: Callable, *arguments) -> tuple:
     """Return a call of a function with these arguments, and the processor time, s, that it took to trace and
     compile it.
     """
@@ -139,7 +141,7 @@ def fastest(run: Callable, repeats: int) -> float:
     return min(seconds_of(run, time.perf_counter)[1] for _ in range(repeats))
 
 
-def least_processor_time(runs: dict[str, Callable], repeats: int) -> dict[str, float]:
+def least_processor_time(runs: dict, repeats: int) -> dict:
     """Return the processor time of each run, s: the least of some repeats, in turn, after a first one that
     compiles.
     """

@@ -14,18 +14,17 @@ import argparse
 import json
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from collections import Counter
+from concurrent.futures import as_completed
 from pathlib import Path
 
-from floats import TYPES, prepare
+from floats import TYPES, prepare, processes
 
 CASES, QUICK = 2500, 300  # in all
 
 
-def run_family(name: str, dtype: str, seeds: list[int]) -> list[dict]:
+def run_family(name, seeds):
     """Records of one family's cases, in this process."""
-    prepare(dtype)
     import jax
     from hunting.families import family
 
@@ -34,7 +33,7 @@ def run_family(name: str, dtype: str, seeds: list[int]) -> list[dict]:
     return found
 
 
-def planned(arguments) -> list[tuple[str, str, list[int]]]:
+def planned(arguments):
     """Family, floats and seeds of every piece of work, longest first."""
     prepare("float64")
     from hunting.families import FAMILIES
@@ -47,57 +46,38 @@ def planned(arguments) -> list[tuple[str, str, list[int]]]:
     first, work = arguments.seed or 0, []
     for f in chosen:
         count = max(1, round(share * f.cases))
-        narrow = [first + k for k in range(count) if f.single and k % 5 == 4] if not arguments.quick else []
-        wide = [first + k for k in range(count) if first + k not in narrow]
-        work += [(f.name, "float64", wide)] + ([(f.name, "float32", narrow)] if narrow else [])
+        seeds = range(first, first + count)
+        narrow = seeds[4::5] if f.single and not arguments.quick else ()
+        work.append((f.name, "float64", [seed for seed in seeds if seed not in narrow]))
+        work += [(f.name, "float32", [*narrow])] if narrow else []
     return sorted(work, key=lambda w: -len(w[2]))
 
 
-def run_all(work, jobs: int, report) -> list[dict]:
+def run_all(work, jobs, report):
     """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after
     every family.
     """
-    from hunting.record import CRASHED
+    from hunting.record import CRASHED, Record
 
-    found: list[dict] = []
+    found = []
     for dtype in TYPES:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            waiting = {pool.submit(run_family, *w): w for w in work if w[1] == dtype}
+        with processes(dtype, jobs) as pool:
+            waiting = {pool.submit(run_family, w[0], w[2]): w for w in work if w[1] == dtype}
             for done in as_completed(waiting):
                 name, _, seeds = waiting[done]
                 try:
                     new = done.result()
                 except Exception as error:  # the process died, or the family itself is broken
                     said = f"{type(error).__name__}: {error}"
-                    lost = {
-                        "family": name,
-                        "dtype": dtype,
-                        "asked": "",
-                        "outcome": CRASHED,
-                        "error": None,
-                        "said": said,
-                        "seconds": 0.0,
-                    }
-                    new = [lost | {"seed": seed} for seed in seeds]
-                found += _said(waiting[done], new)
+                    new = [Record(name, seed, dtype, "", CRASHED, None, said).as_dict() for seed in seeds]
+                counts, seconds = Counter(r["outcome"] for r in new), sum(r["seconds"] for r in new)
+                print(f"{name} ({dtype}): {dict(counts)}, {seconds:.0f} s", file=sys.stderr, flush=True)
+                found += new
                 report(found, new)
     return found
 
 
-def _said(work, records: list[dict]) -> list[dict]:
-    counts = {
-        outcome: sum(r["outcome"] == outcome for r in records)
-        for outcome in dict.fromkeys(r["outcome"] for r in records)
-    }
-    print(
-        f"{work[0]} ({work[1]}): {counts}, {sum(r['seconds'] for r in records):.0f} s",
-        file=sys.stderr,
-        flush=True,
-    )
-    return records
-
-
-def main() -> int:
+def main():
     """Search, print, write; exit code 1 where something is wrong or crashed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -121,7 +101,7 @@ def main() -> int:
 
     print(f"seeds from {arguments.seed or 0}; {sum(len(w[2]) for w in work)} cases", file=sys.stderr)
 
-    def report(records: list[dict], new: list[dict]) -> None:
+    def report(records, new):
         print("".join(f"{line}\n" for line in losses(new)), end="", flush=True)
         if arguments.records:
             arguments.records.write_text(json.dumps(records, indent=1) + "\n")

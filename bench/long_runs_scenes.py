@@ -58,26 +58,13 @@ class ChaoticOscillator(jj.Scene):
 
     coordinates = jj.coordinates("x y1 y2 y3 z1 z2 z3")
     privileged = ("y1_rate", "y2_rate", "y3_rate", "z1_rate", "z2_rate", "z3_rate")
-    example = {
-        "x": 1.0,
-        "y1": 0.6,
-        "y2": 0.4,
-        "y3": 0.2,
-        "z1": 1.0,
-        "z2": 1.0,
-        "z3": 1.0,
-        "y1_rate": 0.8,
-        "z2_rate": 0.3,
-    }
+    example = {"x": 1.0, "y1": 0.6, "y2": 0.4, "y3": 0.2, "z1": 1.0, "z2": 1.0, "z3": 1.0}
+    example |= {"y1_rate": 0.8, "z2_rate": 0.3}
     example_span = 10.0
 
     def bodies(self, t, q):
-        a = q.array
-        return {
-            "first": jj.Particle(1.0, a[:3]),
-            "second": jj.Particle(1.0, a[3:6]),
-            "third": jj.Particle(1.0, jnp.stack([a[6], 0.0 * a[6], 0.0 * a[6]])),
-        }
+        places = {"first": q.array[:3], "second": q.array[3:6], "third": [q.z3, 0.0, 0.0]}
+        return {name: jj.Particle(1.0, place) for name, place in places.items()}
 
     def potential(self, pose):
         q = pose.q.array

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 
 
 @dataclass(frozen=True)
@@ -13,9 +12,8 @@ class Case:
 
     name: str
     title: str
-    probe: Callable[
-        [], object
-    ]  # sets it up, once per process; `cell(method, tolerance)` of what it returns is an `Outcome`
+    # sets it up, once per process; `cell(method, tolerance)` of what it returns is an `Outcome`
+    probe: Callable
     tolerance: float  # float64
     tolerance32: float  # float32
     reason: str  # of both tolerances
@@ -29,12 +27,12 @@ def required(*case, **more) -> Case:
     return Case(*case, must_be_right=True, **more)
 
 
-def unanswered(name: str, title: str, probe: Callable[[], object], reason: str) -> Case:
+def unanswered(name, title, probe, reason) -> Case:
     """A case that has no right number: nothing but a flag is right."""
     return Case(name, title, probe, 0.0, 0.0, reason, flag_is_right=True)
 
 
-def single() -> bool:
+def single():
     """Whether this process computes in float32."""
     return not jax.config.jax_enable_x64
 
@@ -42,8 +40,3 @@ def single() -> bool:
 def by_type(double, single_value):
     """One value for float64, another for float32."""
     return single_value if single() else double
-
-
-def real():
-    """The floating-point type of this process."""
-    return jnp.float32 if single() else jnp.float64

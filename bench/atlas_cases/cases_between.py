@@ -4,10 +4,12 @@ references are those of the search, `bench/hunting`.
 
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 from hunting.families import family
 from hunting.family import Ask, together
+from hunting.oscillators import blow
 
 import jourdain_jax as jj
 from atlas_cases import elsewhere
@@ -29,82 +31,42 @@ class Stopped(Motion):
     t_end: float = 0.0
     end: dict | None = None  # values by name
 
-    def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
+    def of_trajectory(self, motion: jj.Trajectory, tolerance) -> Outcome:
         """Right where the event, its time and the values there are."""
         code = int(motion.result)
         if code != result_codes.EVENT:
             return judged(np.inf, tolerance, motion.message if code else "")
         if motion.event_names[int(motion.event)] != self.event:
             return judged(np.inf, tolerance)
-        at_end = against(
-            self.scene,
-            {name: np.array([value]) for name, value in self.end.items()},
-            dict.fromkeys(self.end, 1.0),
-        )
+        at_end = against(self.scene, self.end, dict.fromkeys(self.end, 1.0))
         late = abs(float(motion.t_end) - self.t_end) / self.t_end
-        return judged(
-            max_error([late, at_end(np.asarray(motion.q_end)[None], np.asarray(motion.u_end)[None])]),
-            tolerance,
-        )
+        off = at_end(np.asarray(motion.q_end)[None], np.asarray(motion.u_end)[None])
+        return judged(max_error([late, off]), tolerance)
 
 
-def of_family(name: str, numbers: dict, saved: int, skip: dict, **more) -> Motion:
+def of_family(name, numbers, saved, skip, **more) -> Motion:
     """A case of the search as a motion: with `saved` times after the start."""
     found, t0 = family(name), numbers.get("t0", 0.0)
     ts = found.saved(Ask("simulate", saved), numbers)
     truth = found.right(together([numbers]), ts[None])
-    scene, start, names = (
-        found.scene().replace(**found.parameters(numbers)),
-        found.begin(numbers),
-        found.names.split(),
-    )
-    shared = {
-        "rtol": 1e-9,
-        "atol": 1e-9,
-        "skip": skip,
-        "options": found.given_inputs(numbers) | ({"t0": t0} if t0 else {}),
-    } | more
+    scene, names = found.scene().replace(**found.parameters(numbers)), found.names.split()
+    options = found.given_inputs(numbers) | ({"t0": t0} if t0 else {})
+    how = {"rtol": 1e-9, "atol": 1e-9, "skip": skip, "options": options} | more
     if truth.event is not None:
+        how |= {"event": truth.event[0], "t_end": float(truth.t_end[0])}
         end = dict(zip(names, truth.last[0], strict=True))
-        return Stopped(
-            scene,
-            start,
-            ts,
-            lambda q, u: np.nan,
-            event=truth.event[0],
-            t_end=float(truth.t_end[0]),
-            end=end,
-            **shared,
-        )
+        return Stopped(scene, found.begin(numbers), ts, lambda q, u: np.nan, end=end, **how)
     expected = dict(zip(names, truth.values[0].T, strict=True))
-    return Motion(
-        scene,
-        start,
-        ts,
-        against(scene, expected, {name: max(1.0, float(np.max(np.abs(x)))) for name, x in expected.items()}),
-        **shared,
-    )
+    scales = {name: max(1.0, float(np.max(np.abs(x)))) for name, x in expected.items()}
+    return Motion(scene, found.begin(numbers), ts, against(scene, expected, scales), **how)
 
 
-def rod_pendulum(saved: int) -> Motion:
+def rod_pendulum(saved) -> Motion:
     """A pendulum in x and z goes round, past positions where neither x nor z determines the other."""
+    numbers = {"length": 1.0, "mass": 1.0, "v": 7.5, "whole": 1.0, "span": 2.0}
+    name, how = ("rod-pendulum", {"asked": ("rollout",)}) if saved == 1 else ("rod-pendulum-in-step", {})
     by_mujoco = lambda: elsewhere.pendulum(1.0, 1.0, 7.5)
-    if saved == 1:
-        return of_family(
-            "rod-pendulum",
-            {"length": 1.0, "mass": 1.0, "v": 7.5, "span": 2.0},
-            1,
-            ROWS_SKIP,
-            asked=("rollout",),
-            by_mujoco=by_mujoco,
-        )
-    return of_family(
-        "rod-pendulum-in-step",
-        {"length": 1.0, "mass": 1.0, "v": 7.5, "whole": 1.0, "span": 2.0},
-        saved,
-        ROWS_SKIP,
-        by_mujoco=by_mujoco,
-    )
+    return of_family(name, numbers, saved, ROWS_SKIP, by_mujoco=by_mujoco, **how)
 
 
 def parallelogram() -> Motion:
@@ -112,14 +74,8 @@ def parallelogram() -> Motion:
     lengths = {"r1": 1.0, "r2": 2.0, "r3": 1.0, "d": 2.0}
     numbers = lengths | {"m1": 1.0, "m2": 1.5, "m3": 0.7, "g": 9.81, "s": 0.7, "s_rate": 8.0, "span": 1.5}
     bars = (1.0, 2.0, 1.0, 2.0), (1.0, 1.5, 0.7), 9.81, ((0.7, 0.0, 0.7), (8.0, 0.0, 8.0)), elsewhere.angles
-    return of_family(
-        "parallelogram",
-        numbers,
-        5,
-        ROWS_SKIP,
-        asked=("rollout",),
-        by_mujoco=lambda: elsewhere.four_bar(*bars),
-    )
+    how = {"asked": ("rollout",), "by_mujoco": lambda: elsewhere.four_bar(*bars)}
+    return of_family("parallelogram", numbers, 5, ROWS_SKIP, **how)
 
 
 def slider_crank() -> Motion:
@@ -133,37 +89,21 @@ def steep_edge() -> Motion:
     scene, ts, v = SteepEdge(), np.array([0.2, 1.5]), 3.0
     after = np.sqrt(v**2 - 2 * 2.0)
     known = {"x": np.array([0.2 * v, 1.0 + after * (1.5 - 1.0 / v)]), "x_rate": np.array([v, after])}
-    return Motion(
-        scene,
-        {"x_rate": v},
-        ts,
-        against(scene, known),
-        rtol=1e-9,
-        atol=1e-9,
-        skip=NO_ROWS_SKIP,
-        asked=("rollout",),
-    )
+    how = {"rtol": 1e-9, "atol": 1e-9, "skip": NO_ROWS_SKIP, "asked": ("rollout",)}
+    return Motion(scene, {"x_rate": v}, ts, against(scene, known), **how)
 
 
 def hammer_blow() -> Motion:
     """2,000 N for a millisecond, two seconds after the start."""
-    flanks, force = (
-        BLOW["when"] + BLOW["length"] * np.array([-0.1, 0.0, 1.0, 1.1]),
-        BLOW["force"] * np.array([0.0, 1.0, 1.0, 0.0]),
-    )
+    flanks, force = blow(SimpleNamespace(**BLOW))
     by_mujoco = lambda: elsewhere.oscillator(BLOW["k"], 0.0, 0.0, 1e-4, lambda t: np.interp(t, flanks, force))
     return of_family("hammer", BLOW, 3, NO_ROWS_SKIP, asked=("rollout",), by_mujoco=by_mujoco)
 
 
 def far_oscillator() -> Motion:
     """Eight turns, 54 years after the clock's zero."""
-    return of_family(
-        "far-times",
-        FAR,
-        3,
-        NO_ROWS_SKIP,
-        by_mujoco=lambda: elsewhere.oscillator(FAR["k"], FAR["x"], FAR["x_rate"], 1e-5),
-    )
+    by_mujoco = lambda: elsewhere.oscillator(FAR["k"], FAR["x"], FAR["x_rate"], 1e-5)
+    return of_family("far-times", FAR, 3, NO_ROWS_SKIP, by_mujoco=by_mujoco)
 
 
 OF_TOLERANCE = "a run at rtol = atol = 1e-9 (float32: 1e-5, 1e-6)"

@@ -26,28 +26,16 @@ CLOSED_REASON = (
 def turning_skate() -> Motion:
     """The skate turns through 90 degrees twice a turn (B2)."""
     ts = np.linspace(0.0, 10.0, 11)
-    return followed(
-        jj.models.Skate(),
-        {"heading_rate": 1.3},
-        ts,
-        skate.motion(ts, **skate.RUN),
-        "x y heading=th",
-        step=0.005,
-    )
+    known = skate.motion(ts, **skate.RUN)
+    return followed(jj.models.Skate(), {"heading_rate": 1.3}, ts, known, "x y heading=th", step=0.005)
 
 
 def vertical_disc_by_heading_and_x() -> Motion:
     """The vertical disc (B4); the fixed partition keeps heading and x, which turning makes singular."""
     ts = np.linspace(0.0, 5.0, 11)
     start, known = {"heading_rate": 2.0, "roll_rate": 1.0}, vertical_disc.motion(ts, **vertical_disc.RUN)
-    return followed(
-        jj.models.VerticalDisc(),
-        start,
-        ts,
-        known,
-        "x y heading=phi roll=th",
-        independent=("x_rate", "heading_rate"),
-    )
+    names, kept = "x y heading=phi roll=th", ("x_rate", "heading_rate")
+    return followed(jj.models.VerticalDisc(), start, ts, known, names, independent=kept)
 
 
 def tilting_disc() -> Motion:
@@ -56,27 +44,18 @@ def tilting_disc() -> Motion:
     ts = np.linspace(0.0, 10.0, 11)
     known = rolling_disc.motion_yaw_lean_spin(ts, **run)
     start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
-    return followed(
-        jj.models.TiltingDisc(),
-        start,
-        ts,
-        known,
-        "x y yaw lean spin",
-        by_mujoco=lambda: _disc_elsewhere(known),
-    )
+    by_mujoco = lambda: _disc_elsewhere(known)
+    return followed(jj.models.TiltingDisc(), start, ts, known, "x y yaw lean spin", by_mujoco=by_mujoco)
 
 
-def _disc_elsewhere(expected: dict) -> elsewhere.Elsewhere:
+def _disc_elsewhere(expected) -> elsewhere.Elsewhere:
     """The disc in contact with a plane; yaw and spin, known up to whole turns, next to the expected ones."""
     saved = iter(range(len(expected["x"])))
 
     def read(data):
-        k = next(saved)
-        return disc_body.state(
-            rolling_disc.RUN["radius"],
-            elsewhere.body_of(data.qpos, data.qvel),
-            {name: expected[name][k] for name in ("yaw", "spin")},
-        )
+        k, body = next(saved), elsewhere.body_of(data.qpos, data.qvel)
+        near = {name: expected[name][k] for name in ("yaw", "spin")}
+        return disc_body.state(rolling_disc.RUN["radius"], body, near)
 
     return replace(rolled_disc(), read=read)
 
@@ -88,9 +67,8 @@ def snakeboard_through_loss_of_rank() -> Motion:
     """Across parallel rows (B14), with a step that ends exactly there."""
     ts = np.linspace(0.0, snakeboard.RUN["t_end"], 9)  # steer is 90 degrees at the fifth
     known = snakeboard.motion(ts, **snakeboard.RUN)
-    travelled = ts[-1] * np.mean(
-        np.abs(snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"])
-    )  # m, on curls
+    speeds = snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"]
+    travelled = ts[-1] * np.mean(np.abs(speeds))  # m, on curls
     names, scales = "x y heading=th rotor=psi heading_rate=th_rate", {"x": travelled, "y": travelled}
     return followed(jj.models.Snakeboard(), SNAKE_START, ts, known, names, scales, asked=("rollout",))
 
@@ -111,15 +89,12 @@ def snakeboard_without_continuation() -> Motion:
     return Motion(scene, start, np.linspace(0.0, 1.0, 3), lambda q, u: np.inf)
 
 
-def heavy_axle(wheel_mass: float = 1.2, axle_mass: float = 0.5) -> Motion:
+def heavy_axle(**masses) -> Motion:
     """The axle with two equal lateral rows (B1)."""
-    run = two_wheel_axle.RUN_HEAVY_AXLE | {"wheel_mass": wheel_mass, "axle_mass": axle_mass}
+    run = two_wheel_axle.RUN_HEAVY_AXLE | masses
     ts = np.linspace(0.0, run["t_end"], 11)
-    start, known = (
-        {"x_rate": run["u0"], "th_rate": run["th_rate"]},
-        two_wheel_axle.motion_heavy_axle(ts, **run),
-    )
-    return followed(HeavyAxle(wheel_mass=wheel_mass, axle_mass=axle_mass), start, ts, known, "x y th p1 p2")
+    start, scene = {"x_rate": run["u0"], "th_rate": run["th_rate"]}, HeavyAxle(**masses)
+    return followed(scene, start, ts, two_wheel_axle.motion_heavy_axle(ts, **run), "x y th p1 p2")
 
 
 def three_edges() -> Motion:
@@ -146,7 +121,7 @@ def bricard() -> Instant:
     return Instant(scene, whole(points), whole(velocities), whole(known))
 
 
-def two_edges(angle: float) -> Instant:
+def two_edges(angle) -> Instant:
     """Two edges on one spot, turned by an angle: the body can only turn, however small the angle; the edges
     bear g sin(slope).
     """

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from disc_body import Body, start
+from scipy.spatial.transform import Rotation
 
 try:
     import mujoco
@@ -41,7 +42,7 @@ class Elsewhere:
     read: Callable = lambda data: (data.qpos.copy(), data.qvel.copy())
     push: Callable | None = None
 
-    def run(self, ts, t0: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    def run(self, ts, t0=0.0):
         """q and u at the times, each reached by steps of equal length; NaN where the engine reports a bad
         state.
         """
@@ -60,84 +61,59 @@ class Elsewhere:
                     data.qfrc_applied[0] = self.push(before + k * model.opt.timestep)
                     mujoco.mj_step(model, data)
             mujoco.mj_forward(model, data)
-            bad = any(
-                data.warning[getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")].number
-                for kind in ("POS", "VEL", "ACC")
-            )
-            q, u = self.read(data)
-            found.append((q + np.nan, u + np.nan) if bad else (q, u))
+            bad = (getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}") for kind in ("POS", "VEL", "ACC"))
+            lost = np.nan if any(data.warning[kind].number for kind in bad) else 0.0
+            found.append([part + lost for part in self.read(data)])
         return tuple(np.array(part) for part in zip(*found, strict=True))
 
 
-def free_body(mass: float, inertia, q, u) -> Elsewhere:
+def free_body(mass, inertia, q, u) -> Elsewhere:
     """A body on which nothing acts."""
-    text = _HEAD.format(step=1e-3, integrator="RK4", gravity=0, more="") + _FREE.format(
-        ground="", mass=mass, inertia=_numbers(inertia), shape=""
-    )
-    return Elsewhere(text, 1e-3, (q, u))
+    body = _FREE.format(ground="", mass=mass, inertia=_numbers(inertia), shape="")
+    return Elsewhere(_head(1e-3, 0) + body, 1e-3, (q, u))
 
 
-def rolling(
-    mass: float,
-    inertia,
-    shape: str,
-    q,
-    u,
-    *,
-    step: float = 1e-4,
-    constant: float = 5,
-    integrator="implicitfast",
-    impratio=100,
-    noslip=0,
-) -> Elsewhere:
+def _head(step, gravity, more="", integrator="RK4"):
+    return _HEAD.format(step=step, integrator=integrator, gravity=gravity, more=more)
+
+
+def rolling(mass, inertia, shape, q, u, *, step=1e-4, integrator="implicitfast") -> Elsewhere:
     """A body that rolls on a plane; friction coefficient 1, time constant of the contact five steps, as short
     as it may be.
     """
-    more = (
-        f'cone="elliptic" impratio="{impratio}" tolerance="1e-12" iterations="100"'
-        f' noslip_iterations="{noslip}" noslip_tolerance="1e-14"'
-    )
-    head = _HEAD.format(step=step, integrator=integrator, gravity=-9.81, more=more)
+    head = _head(step, -9.81, 'cone="elliptic" impratio="100" tolerance="1e-12" iterations="100"', integrator)
     body = _FREE.format(ground=_GROUND, mass=mass, inertia=_numbers(inertia), shape=shape)
-    return Elsewhere(head + _ROLLING.format(reference=constant * step) + body, step, (q, u))
+    return Elsewhere(head + _ROLLING.format(reference=5 * step) + body, step, (q, u))
 
 
-def rolling_disc(mass: float, radius: float, minimal, **settings) -> Elsewhere:
+def rolling_disc(mass, radius, minimal, **settings) -> Elsewhere:
     """A thin cylinder about body y, from a start as in `disc_body`."""
-    body, quaternion = start(radius, minimal), np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, body.rotation.ravel())
+    body = start(radius, minimal)
     shape = f'<geom type="cylinder" size="{radius} 1e-4" euler="90 0 0"/>'
-    q, u = (
-        np.concatenate([body.centre, quaternion]),
-        np.concatenate([body.velocity, body.rotation.T @ body.angular_velocity]),
-    )
+    q = [*body.centre, *Rotation.from_matrix(body.rotation).as_quat(scalar_first=True)]
+    u = [*body.velocity, *(body.rotation.T @ body.angular_velocity)]
     return rolling(mass, mass * radius**2 * np.array([0.25, 0.5, 0.25]), shape, q, u, **settings)
 
 
 def body_of(position, velocity) -> Body:
     """The body of a free joint."""
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(position[3:], float))
-    rotation = rotation.reshape(3, 3)
-    return Body(
-        np.asarray(position[:3]), rotation, np.asarray(velocity[:3]), rotation @ np.asarray(velocity[3:])
-    )
+    position, velocity = np.asarray(position, float), np.asarray(velocity, float)
+    rotation = Rotation.from_quat(position[3:], scalar_first=True).as_matrix()
+    return Body(position[:3], rotation, velocity[:3], rotation @ velocity[3:])
 
 
-def ball_shape(radius: float, middle) -> str:
+def ball_shape(radius, middle):
     """A ball about `middle`."""
     return f'<geom type="sphere" size="{radius}" pos="{_numbers(middle)}"/>'
 
 
-def four_bar(lengths, masses, gravity: float, start, read) -> Elsewhere:
+def four_bar(lengths, masses, gravity, start, read) -> Elsewhere:
     """Crank, coupler on it, and rocker on the ground, hinged about -y (angles from x towards z); `connect`
     closes the loop. `start`: a, b, c and rates.
     """
     (r1, r2, r3, d), (m1, m2, m3) = lengths, masses
     (a, b, c), (da, db, dc) = start
-    head = _HEAD.format(
-        step=1e-4, integrator="RK4", gravity=-gravity, more='tolerance="1e-12" iterations="100"'
-    )
+    head = _head(1e-4, -gravity, 'tolerance="1e-12" iterations="100"')
     hinge, site = '<joint type="hinge" axis="0 -1 0"/>', '<site name="{}" pos="{} 0 0"/>'
     coupler = f'<body pos="{r1} 0 0">{hinge}{_rod(m2, r2)}{site.format("end", r2)}</body>'
     rocker = f'<body pos="{d} 0 0">{hinge}{_rod(m3, r3)}{site.format("pin", r3)}</body>'
@@ -149,22 +125,22 @@ def four_bar(lengths, masses, gravity: float, start, read) -> Elsewhere:
     return Elsewhere(text, 1e-4, ([a, b - a, c], [da, db - da, dc]), read)
 
 
-def angles(data) -> tuple[np.ndarray, np.ndarray]:
+def angles(data):
     """a, b, c of crank, coupler and rocker, and their rates."""
     (a, b, c), (da, db, dc) = data.qpos, data.qvel
     return np.array([a, a + b, c]), np.array([da, da + db, dc])
 
 
-def ends_of_cranks(data) -> tuple[np.ndarray, np.ndarray]:
+def ends_of_cranks(data):
     """x and z of the ends of two cranks of 1 m that stand 1 m apart, and their rates."""
     (a, _, c), (da, _, dc) = data.qpos, data.qvel
     q = np.array([np.cos(a), np.sin(a), 1 + np.cos(c), np.sin(c)])
     return q, np.array([-np.sin(a) * da, np.cos(a) * da, -np.sin(c) * dc, np.cos(c) * dc])
 
 
-def pendulum(length: float, mass: float, speed: float) -> Elsewhere:
+def pendulum(length, mass, speed) -> Elsewhere:
     """A particle on a hinge, in x and z."""
-    head = _HEAD.format(step=1e-4, integrator="RK4", gravity=-9.81, more="")
+    head = _head(1e-4, -9.81)
     bob = f'<inertial pos="0 0 {-length}" mass="{mass}" diaginertia="1e-12 1e-12 1e-12"/>'
     text = f'{head}<worldbody><body><joint type="hinge" axis="0 -1 0"/>{bob}</body></worldbody></mujoco>'
 
@@ -176,21 +152,18 @@ def pendulum(length: float, mass: float, speed: float) -> Elsewhere:
     return Elsewhere(text, 1e-4, ([0.0], [speed / length]), read)
 
 
-def oscillator(stiffness: float, x: float, v: float, step: float, push=None) -> Elsewhere:
+def oscillator(stiffness, x, v, step, push=None) -> Elsewhere:
     """A block of 1 kg on a spring."""
-    head = _HEAD.format(step=step, integrator="RK4", gravity=0, more="")
     slide = f'<joint type="slide" axis="1 0 0" stiffness="{stiffness}"/>'
-    text = (
-        f'{head}<worldbody><body>{slide}<inertial pos="0 0 0" mass="1" diaginertia="1 1'
-        ' 1"/></body></worldbody></mujoco>'
-    )
+    block = f'<body>{slide}<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    text = f"{_head(step, 0)}<worldbody>{block}</worldbody></mujoco>"
     return Elsewhere(text, step, ([x], [v]), push=push)
 
 
-def _rod(mass: float, length: float) -> str:
+def _rod(mass, length):
     turned = mass * length**2 / 12
     return f'<inertial pos="{length / 2} 0 0" mass="{mass}" diaginertia="{turned * 1e-3} {turned} {turned}"/>'
 
 
-def _numbers(values) -> str:
+def _numbers(values):
     return " ".join(f"{float(v)!r}" for v in values)

@@ -32,7 +32,7 @@ class DerivativeOfMotion:
     begin: Callable
     x: float
     ts: np.ndarray
-    value: Callable[[jj.Trajectory], jax.Array]
+    value: Callable
     known: float
     scale: float | None = None
     rtol: float = 1e-10
@@ -41,35 +41,24 @@ class DerivativeOfMotion:
     skip: dict = field(default_factory=dict)
     naive_value: Callable | None = None  # (q_end, u_end) -> value; None: naive methods are not asked
 
-    def cell(self, method: Method, tolerance: float) -> Outcome:
+    def cell(self, method: Method, tolerance) -> Outcome:
         """Outcome of one method."""
         why = self.skip.get(method.name, self.skip.get(method.group))
-        if (
-            why is not None
-            or method.group in ("constraints", "elsewhere")
-            or method.even_steps
-            or method.name == "Radau IIA"
-        ):
+        of_motions = method.group in ("constraints", "elsewhere") or method.name == "Radau IIA"
+        if why is not None or of_motions or method.even_steps:
             return not_applicable(why or "asked of motions")
-        x = jnp.asarray(self.x, jnp.result_type(float))
+        x = jnp.asarray(self.x, float)
         if method.naive is not None:
             return self._by_naive(method, x, tolerance)
-        options = method.options(self.begin(x)[0])
-        if (
-            method.reduction
-        ):  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
-            options |= {
-                "max_steps": FEWER_STEPS,
-                "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction]),
-            }
+        scene = self.begin(x)[0]
+        options = method.options(scene) | {"ts": self.ts, "retry": True}
+        options |= {"rtol": by_type(self.rtol, 1e-5), "atol": by_type(self.atol, 1e-6)}
+        # each by itself: reverse mode through the choice of one out of several has met NaN of the others
+        if method.reduction:
+            full = jj.Formulation("full", jj.reductions(scene)[method.reduction])
+            options |= {"max_steps": FEWER_STEPS, "formulation": full}
         if method.name == "Kvaerno5":
             options |= {"max_steps": IMPLICIT_STEPS}
-        options |= {
-            "rtol": by_type(self.rtol, 1e-5),
-            "atol": by_type(self.atol, 1e-6),
-            "ts": self.ts,
-            "retry": True,
-        }
 
         def value(x):
             scene, start = self.begin(x)
@@ -80,38 +69,28 @@ class DerivativeOfMotion:
                 motion = jj.simulate(scene, start, **options)
             return self.value(motion), motion.result
 
-        forward = method.name == "forward mode"
         try:
             with warnings.catch_warnings(record=True) as given:
                 warnings.simplefilter("always")
-                if forward:
+                if method.name == "forward mode":
                     _, slope, code = jax.jvp(value, (x,), (jnp.ones_like(x),), has_aux=True)
                 else:
                     slope, code = jax.grad(value, has_aux=True)(x)
         except (ValueError, jj.DifferentiationModeError) as refusal:
             return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
-        if int(code) not in (result_codes.SUCCESS, result_codes.EVENT):
-            return judged(
-                np.nan,
-                tolerance,
-                result_codes.MESSAGES[int(code)],
-                stalled=int(code) == result_codes.MAX_STEPS,
-            )
-        found = judged(worst(float(slope), self.known, self.scale), tolerance)
-        said = [
-            str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)
-        ]
-        return (
-            found
-            if found.outcome == "right" or not said
-            else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")
-        )
+        code = int(code)
+        if code not in (result_codes.SUCCESS, result_codes.EVENT):
+            said = result_codes.MESSAGES[code]
+            return judged(np.nan, tolerance, said, stalled=code == result_codes.MAX_STEPS)
+        error = worst(slope, self.known, self.scale)
+        said = [f"warning: {w.message}" for w in given if issubclass(w.category, jj.SensitivityWarning)]
+        return judged(error, tolerance, "" if error <= tolerance else "".join(said[:1]))
 
-    def _by_naive(self, method: Method, x, tolerance: float) -> Outcome:
-        if self.naive_value is None or method.naive in naive.REDUCED_STATE:
-            return not_applicable(
-                "fixed steps find no event" if self.naive_value is None else "asked of motions"
-            )
+    def _by_naive(self, method: Method, x, tolerance) -> Outcome:
+        if self.naive_value is None:
+            return not_applicable("fixed steps find no event")
+        if method.naive in naive.REDUCED_STATE:
+            return not_applicable("asked of motions")
         scene, start = self.begin(x)
         state = jj.start(scene, **start)
         static = naive.fixed_point(scene, state.q, state.u)
@@ -119,13 +98,12 @@ class DerivativeOfMotion:
         def value(x):
             scene, start = self.begin(x)
             state = jj.start(scene, **start)
-            qs, us = naive.motion(
-                method.naive, scene, static, state.q, state.u, self.ts, self.steps, alone=True
-            )
+            asked = (method.naive, scene, static, state.q, state.u, self.ts, self.steps)
+            qs, us = naive.motion(*asked, alone=True)
             return self.naive_value(qs[-1], us[-1])
 
         try:
             slope = jax.jvp(value, (x,), (jnp.ones_like(x),))[1]
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
-        return judged(worst(float(slope), self.known, self.scale), tolerance)
+        return judged(worst(slope, self.known, self.scale), tolerance)

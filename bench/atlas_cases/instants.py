@@ -10,7 +10,7 @@ import numpy as np
 import jourdain_jax as jj
 from atlas_cases import naive
 from atlas_cases.methods import Method, reduction
-from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
+from atlas_cases.outcomes import RIGHT, Outcome, judged, not_applicable, worst
 from jourdain_jax.program.eager import eval_numpy
 
 ONLY_MOTION = "no motion is asked"
@@ -28,28 +28,25 @@ class Instant:
     scale: float | None = None
     force: np.ndarray | None = None  # known constraint force on the speeds
 
-    def cell(self, method: Method, tolerance: float) -> Outcome:
+    def cell(self, method: Method, tolerance) -> Outcome:
         """Outcome of one method."""
         if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
             return not_applicable(ONLY_MOTION)
-        q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
+        q, u = jnp.asarray(self.q, float), jnp.asarray(self.u, float)
         if method.naive is not None:
-            udot = naive.accelerations(
-                method.naive, self.scene, naive.fixed_point(self.scene, q, u), 0.0, q, u
-            )
+            static = naive.fixed_point(self.scene, q, u)
+            udot = naive.accelerations(method.naive, self.scene, static, 0.0, q, u)
             return judged(worst(udot, self.udot, self.scale), tolerance)
         found = jj.accelerations(self.scene, 0.0, q, u, reduction=reduction(self.scene, method.reduction))
         error = worst(found.udot, self.udot, self.scale)
         if self.force is not None:
             error = float(np.maximum(error, worst(found.constraint_force, self.force)))
         plain = judged(error, tolerance)
-        if plain.outcome == "right" and bool(found.applicable):
-            return plain
-        flag = flags_of(found)
-        return judged(error, tolerance, flag) if flag else plain
+        right = plain.outcome == RIGHT and bool(found.applicable)
+        return plain if right else judged(error, tolerance, flags_of(found))
 
 
-def flags_of(found: jj.Accelerations) -> str:
+def flags_of(found: jj.Accelerations):
     """What accelerations say against themselves: not applicable, fewer independent rows than rows, a small
     singular value, a residual.
     """
@@ -65,39 +62,35 @@ def flags_of(found: jj.Accelerations) -> str:
 
 @dataclass
 class DerivativeOfAccelerations:
-    """`d w.udot/d x` at one state, in reverse mode, against a known derivative; `state(x)` gives scene,
-    q, u.
+    """`d w.udot/d x` at one state, in reverse mode, against a known derivative; `state(x)` gives entries of q
+    and u.
     """
 
+    scene: jj.Scene
     state: Callable
     x: float
-    weights: np.ndarray
+    weights: tuple
     known: float
     traced: dict = field(default_factory=dict)  # one program serves all reductions
 
-    def cell(self, method: Method, tolerance: float) -> Outcome:
+    def cell(self, method: Method, tolerance) -> Outcome:
         """Outcome of one method."""
         if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
             return not_applicable(ONLY_MOTION)
-        weights = jnp.asarray(self.weights, jnp.result_type(float))
-        scene, q, u = self.state(jnp.asarray(self.x))
-        static = naive.fixed_point(scene, q, u) if method.naive else None
+        scene, weights = self.scene, jnp.asarray(self.weights, float)
+        at = lambda x: map(jnp.stack, self.state(x))
+        static = naive.fixed_point(scene, *at(jnp.asarray(self.x))) if method.naive else None
 
         def value(x, way):
-            scene, q, u = self.state(x)
             if method.naive is not None:
-                return weights @ naive.accelerations(method.naive, scene, static, 0.0, q, u)
-            return weights @ jj.accelerations(scene, 0.0, q, u, reduction=way).udot
+                return weights @ naive.accelerations(method.naive, scene, static, 0.0, *at(x))
+            return weights @ jj.accelerations(scene, 0.0, *at(x), reduction=way).udot
 
         key = method.naive or ("default" if method.reduction is None else "reductions")
         if key not in self.traced:
             self.traced[key] = eval_numpy(jax.grad(value))  # looked at once: compiling would take longer
         try:
-            slope = float(
-                self.traced[key](
-                    jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)
-                )
-            )
+            slope = float(self.traced[key](jnp.asarray(self.x), reduction(scene, method.reduction)))
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
         return judged(worst(slope, self.known), tolerance)

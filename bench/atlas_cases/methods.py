@@ -14,26 +14,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 import jourdain_jax as jj
+from atlas_cases import naive
 from jourdain_jax.equations import GibbsAppell
 from jourdain_jax.equations.reductions import Reduced, reduce
 
 REDUCTIONS = ("privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell")
-INTEGRATORS: dict[str, Callable] = {
+INTEGRATORS: dict = {
     "Tsit5": diffrax.Tsit5,
     "Dopri8": diffrax.Dopri8,
     "Kvaerno5": diffrax.Kvaerno5,
     "Radau IIA": jj.RadauIIA,
 }
-EVEN_STEPS = {
-    "implicit midpoint": jj.ImplicitMidpoint,
-    "DLA": jj.DiscreteLagrangeDAlembert,
-    "discrete gradient": jj.DiscreteGradient,
-}  # of a `step`
-STABILISED = {
-    "no projection": 0.0,
-    "Baumgarte 5/s": 5.0,
-    "Baumgarte 1e4/s": 1e4,
-}  # rates; one program serves all
+EVEN_STEPS = {"implicit midpoint": jj.ImplicitMidpoint, "DLA": jj.DiscreteLagrangeDAlembert}  # of a `step`
+EVEN_STEPS["discrete gradient"] = jj.DiscreteGradient
+# rates; one program serves all
+STABILISED = {"no projection": 0.0, "Baumgarte 5/s": 5.0, "Baumgarte 1e4/s": 1e4}
 
 
 class OneOf(GibbsAppell):
@@ -58,24 +53,17 @@ class OneOf(GibbsAppell):
 
 
 def _uniform(found: Reduced) -> Reduced:
-    return Reduced(
-        found.udot,
-        found.constraint_force,
-        jnp.asarray(found.pivot, found.udot.dtype),
-        jnp.asarray(found.applicable),
-    )
+    pivot = jnp.asarray(found.pivot, found.udot.dtype)
+    return Reduced(found.udot, found.constraint_force, pivot, jnp.asarray(found.applicable))
 
 
-def reduction(scene, name: str | None):
+def reduction(scene, name):
     """The engine's reduction `name` for a scene."""
     if name is None:
         return None
     known = jj.reductions(scene)
-    return OneOf(
-        known["gibbs-appell"].independent,
-        jnp.asarray(REDUCTIONS.index(name)),
-        tuple(known[member] for member in REDUCTIONS),
-    )
+    members = tuple(known[member] for member in REDUCTIONS)
+    return OneOf(known["gibbs-appell"].independent, jnp.asarray(REDUCTIONS.index(name)), members)
 
 
 @dataclass(frozen=True)
@@ -91,36 +79,22 @@ class Method:
     elsewhere: bool = False  # by another engine
 
     @property
-    def even_steps(self) -> bool:
+    def even_steps(self):
         """Whether it takes steps of one length."""
         return self.name in EVEN_STEPS
 
 
-def _by_reduction(name: str) -> Method:
-    return Method(
-        name,
-        "reductions",
-        lambda scene: {"formulation": jj.Formulation("full", reduction(scene, name))},
-        reduction=name,
-    )
+def _by_reduction(name) -> Method:
+    chosen = lambda scene: {"formulation": jj.Formulation("full", reduction(scene, name))}
+    return Method(name, "reductions", chosen, reduction=name)
 
 
-def _stabilised(name: str, rate: float) -> Method:
+def _stabilised(name, rate) -> Method:
     terms = lambda scene: {"formulation": jj.Formulation("full", stabilisation=jj.Baumgarte(rate, rate))}
     return Method(name, "constraints", terms)
 
 
-NAIVE = (
-    "fixed partition",
-    "Schur, Cholesky",
-    "KKT, LU",
-    "pinv, 1e-10",
-    "ridge 1e-6",
-    "raw SVD basis",
-    "raw QR basis",
-    "speeds in SVD basis",
-    "speeds in QR basis",
-)
+NAIVE = dict.fromkeys((*naive.ACCELERATIONS, *naive.REDUCED_STATE))
 METHODS: tuple[Method, ...] = (
     Method("default", "engine"),
     Method("rollout", "engine", batch=True),

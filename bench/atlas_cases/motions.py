@@ -13,9 +13,8 @@ import numpy as np
 import jourdain_jax as jj
 from atlas_cases import elsewhere, naive
 from atlas_cases.case import by_type, single
-from atlas_cases.elsewhere import Elsewhere
 from atlas_cases.methods import EVEN_STEPS, Method
-from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
+from atlas_cases.outcomes import NAN, RIGHT, Outcome, judged, not_applicable, worst
 from jourdain_jax.equations import constraint_rows
 from jourdain_jax.integrate import result_codes
 
@@ -35,7 +34,7 @@ class Motion:
     scene: jj.Scene
     start: object  # dict or State
     ts: np.ndarray
-    error: Callable[[np.ndarray, np.ndarray], float]  # q (times, n), u (times, m) -> error
+    error: Callable  # q (times, n), u (times, m) -> error
     rtol: float = 1e-12
     atol: float = 1e-12
     rtol32: float = 1e-5
@@ -51,9 +50,9 @@ class Motion:
     asked: tuple[str, ...] = ()  # costly methods, `SELDOM`, that are asked here
     step: float | None = None  # s, of integrators that take steps of one length; None: they are not asked
     naive_start: tuple | None = None  # (q, u) for methods that do not project a start
-    by_mujoco: Callable[[], Elsewhere] | None = None  # the case as a model of another engine
+    by_mujoco: Callable | None = None  # the case as a model of another engine
 
-    def cell(self, method: Method, tolerance: float) -> Outcome:
+    def cell(self, method: Method, tolerance) -> Outcome:
         """Outcome of one method."""
         if method.elsewhere:
             return self._elsewhere(tolerance)
@@ -75,7 +74,7 @@ class Motion:
         return self.of_trajectory(motion, tolerance)
 
     @property
-    def tolerances(self) -> dict:
+    def tolerances(self):
         """rtol and atol of this process's floats."""
         return {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, 1e-6)}
 
@@ -87,17 +86,11 @@ class Motion:
     def _simulate(self, method: Method):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            steps: dict = {"solver": EVEN_STEPS[method.name](step=self.step)} if method.even_steps else {}
+            steps = {"solver": EVEN_STEPS[method.name](step=self.step)} if method.even_steps else {}
             if method.reduction or (single() and method.group == "constraints" and method.name not in SELDOM):
                 steps["max_steps"] = by_type(self.most_steps, 5_000)
-            return jj.simulate(
-                self.scene,
-                self.start,
-                ts=self.ts,
-                retry=True,
-                **self.tolerances,
-                **{**self.options, **method.options(self.scene), **steps},
-            )
+            options = self.tolerances | self.options | method.options(self.scene) | steps
+            return jj.simulate(self.scene, self.start, ts=self.ts, retry=True, **options)
 
     def _rollout(self):
         """Two equal lanes of a batch; the second one."""
@@ -108,37 +101,28 @@ class Motion:
                 self.scene, lanes, ts=self.ts, retry=True, **self.tolerances, **self.options
             ).lane(1)
 
-    def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
+    def of_trajectory(self, motion: jj.Trajectory, tolerance) -> Outcome:
         """Outcome of a trajectory: its result code, its numbers, and what its summary warns of."""
         code = int(motion.result)
-        if code == result_codes.MAX_STEPS:
-            return judged(
-                np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True
-            )
         if code != result_codes.SUCCESS:
-            return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)")
+            said = f"{motion.message} (t = {float(motion.t_end):.3g} s)"
+            return judged(np.nan, tolerance, said, stalled=code == result_codes.MAX_STEPS)
         error = self.error(np.asarray(motion.q, float), np.asarray(motion.u, float))
         found = judged(error, tolerance)
-        if found.outcome == "right":
-            return found
-        return judged(error, tolerance, "; ".join(motion.warnings))
+        return found if found.outcome == RIGHT else judged(error, tolerance, "; ".join(motion.warnings))
 
-    def _elsewhere(self, tolerance: float) -> Outcome:
-        why = (
-            "its model of the case would be another one"
-            if self.by_mujoco is None
-            else elsewhere.MISSING
-            if elsewhere.mujoco is None
-            else ""
-        )
-        if why or single():
-            return not_applicable(why or "it computes in double precision")
+    def _elsewhere(self, tolerance) -> Outcome:
+        if self.by_mujoco is None:
+            return not_applicable("its model of the case would be another one")
+        if elsewhere.mujoco is None:
+            return not_applicable(elsewhere.MISSING)
+        if single():
+            return not_applicable("it computes in double precision")
         with np.errstate(all="ignore"):
-            return judged(
-                self.error(*self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))), tolerance
-            )
+            states = self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))
+            return self._by_error(*states, tolerance)
 
-    def _by_naive(self, method: Method, tolerance: float) -> Outcome:
+    def _by_naive(self, method: Method, tolerance) -> Outcome:
         state = self.state
         q, u = (state.q, state.u) if self.naive_start is None else map(jnp.asarray, self.naive_start)
         rows = constraint_rows(self.scene, 0.0, q, u)
@@ -148,34 +132,29 @@ class Motion:
             return not_applicable("no rows that are linear in the speeds")
         static = naive.fixed_point(self.scene, q, u, independent=self.independent)
         qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, self.steps)
+        return self._by_error(qs, us, tolerance)
+
+    def _by_error(self, qs, us, tolerance) -> Outcome:
         qs, us = np.asarray(qs, float), np.asarray(us, float)
         if not (np.all(np.isfinite(qs)) and np.all(np.isfinite(us))):
             return Outcome(NAN)
         return judged(self.error(qs, us), tolerance)
 
 
-def against(
-    scene: jj.Scene, expected: dict, scales: dict | None = None
-) -> Callable[[np.ndarray, np.ndarray], float]:
+def against(scene: jj.Scene, expected, scales=None):
     """Error against named coordinates and speeds at all times, each relative to its own size (or its entry in
     `scales`).
     """
-    names = (scene.coordinate_names.entries, scene.speed_names.entries)
+    names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
 
     def error(q, u):
-        columns = [
-            q[:, names[0].index(name)] if name in names[0] else u[:, names[1].index(name)]
-            for name in expected
-        ]
-        pairs = zip(expected, columns, strict=True)
-        return max_error(worst(column, expected[name], (scales or {}).get(name)) for name, column in pairs)
+        found = dict(zip(names, (*q.T, *u.T), strict=True))
+        return max_error(worst(found[name], x, (scales or {}).get(name)) for name, x in expected.items())
 
     return error
 
 
-def followed(
-    scene: jj.Scene, start, ts, known: dict, names: str, scales: dict | None = None, **more
-) -> Motion:
+def followed(scene: jj.Scene, start, ts, known, names, scales=None, **more) -> Motion:
     """A motion whose coordinates an oracle knows; `names`: of ours, "ours=theirs" where the oracle calls it
     otherwise.
     """
@@ -185,9 +164,7 @@ def followed(
     )
 
 
-def drift(
-    *integrals: Callable[[np.ndarray, np.ndarray], np.ndarray], size: float | None = None
-) -> Callable[[np.ndarray, np.ndarray], float]:
+def drift(*integrals, size=None):
     """Error as the largest change of integrals of the motion, relative to their start or to `size`."""
 
     def error(q, u):
@@ -197,7 +174,7 @@ def drift(
     return error
 
 
-def max_error(errors) -> float:
+def max_error(errors):
     """The largest; NaN where one is."""
     errors = list(errors)
     return float("nan") if any(np.isnan(e) for e in errors) else max(errors)

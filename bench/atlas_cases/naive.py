@@ -28,7 +28,7 @@ class Static:
     dependent: tuple[int, ...]
 
 
-def fixed_point(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) -> Static:
+def fixed_point(scene, q, u, t=0.0, independent=None) -> Static:
     """Rank at the start, and the partition that is best there (or the one asked for)."""
     A = np.asarray(constraint_rows(scene, t, q, u).A, float)
     cut = 4096 * float(jnp.finfo(q.dtype).eps) * np.linalg.norm(A) if A.size else 0.0
@@ -43,7 +43,7 @@ def fixed_point(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) 
     return Static(rank, rows, tuple(sorted(dependent)))
 
 
-def _pivots(A, count: int) -> tuple[int, ...]:
+def _pivots(A, count):
     """Columns of A that greedy elimination takes first."""
     A, chosen = np.array(A, float), []
     for _ in range(count):
@@ -91,12 +91,12 @@ def _kkt(M, f, A, b, static):
     ]
 
 
-def svd_basis(A, rank: int):
+def svd_basis(A, rank):
     """Null space as LAPACK gives it, derivative and all."""
     return jnp.linalg.svd(A, full_matrices=True)[2][rank:].T
 
 
-def qr_basis(A, rank: int):
+def qr_basis(A, rank):
     """Null space from an unpivoted QR decomposition."""
     return jnp.linalg.qr(A.T, mode="complete")[0][:, rank:]
 
@@ -128,18 +128,18 @@ REDUCED_STATE = {
 SPEEDS_IN_BASIS = ("speeds in SVD basis", "speeds in QR basis")
 
 
-def accelerations(name: str, scene, static: Static, t, q, u):
+def accelerations(name, scene, static: Static, t, q, u):
     """udot by the naive method `name`."""
     equations, rows = equations_and_rows(scene, t, q, u)
     return _solved(name, static, equations.M, equations.Q - equations.h, rows.A, -rows.drift)
 
 
 @eager_if_concrete
-def _solved(name: str, static: Static, M, f, A, b):
+def _solved(name, static: Static, M, f, A, b):
     return jnp.linalg.solve(M, f) if A.shape[0] == 0 else ACCELERATIONS[name](M, f, A, b, static)
 
 
-def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int, *, alone: bool = False):
+def motion(name, scene, static: Static, q, u, ts, steps, *, alone=False):
     """q and u at `ts` (the first is the start) with `steps` equal steps from each time to the next.
 
     `alone`: a program of its own, for derivatives: where methods share one, a method without a derivative
@@ -165,7 +165,7 @@ def _plus(y, factor, slope):
     return jax.tree.map(lambda a, b: a + factor * b, y, slope)
 
 
-def _runge_kutta(rates, y, ts, steps: int):
+def _runge_kutta(rates, y, ts, steps):
     """Classical fourth order, states at all `ts`."""
 
     def interval(y, ends):
@@ -192,7 +192,7 @@ def _runge_kutta(rates, y, ts, steps: int):
 
 
 @partial(jax.jit, static_argnames=("static", "steps", "names"))
-def _all_in_one(scene, index, q, u, ts, static: Static, steps: int, names: tuple[str, ...]):
+def _all_in_one(scene, index, q, u, ts, static: Static, steps, names):
     def rates(t, y):
         q, u = y
         equations, rows = equations_and_rows(scene, t, q, u)
@@ -206,7 +206,7 @@ def _all_in_one(scene, index, q, u, ts, static: Static, steps: int, names: tuple
 
 
 @partial(jax.jit, static_argnames=("static", "steps", "names"))
-def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[str, ...]):
+def _in_basis(scene, index, q, u, ts, static: Static, steps, names):
     """A state of as many speeds s as there are freedoms: `u = Z s`, `sdot = Z+ (udot - Zdot s)`, Zdot by a
     difference.
 

@@ -6,15 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE = (
-    "right",
-    "flagged",
-    "wrong",
-    "nan",
-    "stalled",
-    "not applicable",
-)
-OUTCOMES = (RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE)
+OUTCOMES = ("right", "flagged", "wrong", "nan", "stalled", "not applicable")
+RIGHT, FLAGGED, WRONG, NAN, STALLED, NOT_APPLICABLE = OUTCOMES
 
 
 @dataclass(frozen=True)
@@ -28,32 +21,25 @@ class Outcome:
     flag: str = ""
 
 
-def judged(error: float, tolerance: float, flag: str = "", stalled: bool = False) -> Outcome:
+def judged(error, tolerance, flag="", stalled=False) -> Outcome:
     """Right where the error is within the tolerance and nothing is flagged; else flagged, NaN or wrong."""
-    error = float(error)
-    known = None if np.isnan(error) else error
-    if stalled:
-        return Outcome(STALLED, known, flag)
-    if flag:
-        return Outcome(FLAGGED, known, flag)
-    if np.isnan(error):
-        return Outcome(NAN)
-    return Outcome(RIGHT if error <= tolerance else WRONG, error)
+    known = None if np.isnan(error) else float(error)
+    if stalled or flag:
+        return Outcome(STALLED if stalled else FLAGGED, known, flag)
+    return Outcome(NAN if known is None else RIGHT if known <= tolerance else WRONG, known)
 
 
-def not_applicable(why: str) -> Outcome:
+def not_applicable(why) -> Outcome:
     """The method cannot be asked about this case."""
     return Outcome(NOT_APPLICABLE, None, why)
 
 
-def worst(values, expected, scale=None) -> float:
+def worst(values, expected, scale=None):
     """Largest |value - expected| relative to `scale` (default: the largest |expected|, at least 1e-300); NaN
     where a value is not finite.
     """
     values, expected = np.asarray(values, float), np.asarray(expected, float)
-    size = max(float(np.max(np.abs(expected), initial=0.0)), 1e-300) if scale is None else scale
-    return (
-        float("nan")
-        if not np.all(np.isfinite(values))
-        else float(np.max(np.abs(values - expected), initial=0.0) / size)
-    )
+    if not np.all(np.isfinite(values)):
+        return float("nan")
+    size = max(np.max(np.abs(expected), initial=0.0), 1e-300) if scale is None else scale
+    return float(np.max(np.abs(values - expected), initial=0.0) / size)

@@ -6,7 +6,7 @@ from oracles.rattleback import RUN as CELT
 from oracles.reference import LONG, integrate, solve
 
 
-def celt_without_angles(ts, mu0, w0) -> np.ndarray:
+def celt_without_angles(ts, mu0, w0):
     """mu (downward vertical in body axes) and w of the rattleback (B15), (times, 6): `mu' = mu x w`,
     `I w' + w x I w = rho x F`.
     """
@@ -30,14 +30,14 @@ def celt_without_angles(ts, mu0, w0) -> np.ndarray:
     return integrate(rates, [*mu0, *w0], ts)
 
 
-def linkage_angle(ts) -> np.ndarray:
+def linkage_angle(ts):
     """Angle of the parallel cranks of the n-four-bar (two windows) from upright: `3 a'' = 3.5 g sin a`, a' =
     1 rad/s at the start.
     """
     return integrate(lambda _, y: [y[1], LONG(35) / 30 * LONG(9.81) * np.sin(y[0])], [0.0, 1.0], ts)[:, 0]
 
 
-def octahedron_rods(points, edges) -> tuple[np.ndarray, np.ndarray]:
+def octahedron_rods(points, edges):
     """Rods (6, 3) of half a line-symmetric octahedron, and their rows (6, 9) on its three vertices; `edges`:
     (i, j, whether the rod ends at the image of j).
     """
@@ -54,7 +54,7 @@ def octahedron_rods(points, edges) -> tuple[np.ndarray, np.ndarray]:
     return np.array(rods), rows
 
 
-def bricard_accelerations(points, velocities, masses, edges) -> np.ndarray:
+def bricard_accelerations(points, velocities, masses, edges):
     """Accelerations (3, 3) of the three vertices of a line-symmetric octahedron under gravity, images turned
     by half a turn about z.
 
@@ -70,7 +70,7 @@ def bricard_accelerations(points, velocities, masses, edges) -> np.ndarray:
     return (force + W @ solve(rows @ W, -np.sum(rates**2, axis=1) - rows @ force)).reshape(3, 3)
 
 
-def ball_on_switched_turntable(ts, x0, v0) -> np.ndarray:
+def ball_on_switched_turntable(ts, x0, v0):
     """x, y, vx, vy: `R'' = (2/7) (Om' z x R + Om z x R')` with Om = -2 tanh(3 (t - 1))."""
 
     def rates(t, y):
@@ -82,7 +82,7 @@ def ball_on_switched_turntable(ts, x0, v0) -> np.ndarray:
     return integrate(rates, [*x0, *v0], ts)
 
 
-def fall_time_slope(lean: float, end: float = 1.5, radius: float = 0.5) -> float:
+def fall_time_slope(lean, end=1.5, radius=0.5):
     """dt*/dlean of a disc at rest that falls from `lean` to `end`: t* = sqrt(5a/(8g)) int dx / sqrt(cos(lean)
     - cos(x)).
     """
@@ -101,7 +101,7 @@ def fall_time_slope(lean: float, end: float = 1.5, radius: float = 0.5) -> float
         return float(mpmath.diff(fall_time, mpmath.mpf(lean), h=mpmath.mpf("1e-8")))
 
 
-def slope(value, x: float, step: float = 1e-4) -> float:
+def slope(value, x, step=1e-4):
     """Derivative of a smooth closed form: central differences, extrapolated once."""
     wide, narrow = ((value(x + h) - value(x - h)) / (2 * h) for h in (step, step / 2))
     return (4 * narrow - wide) / 3

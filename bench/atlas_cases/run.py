@@ -1,19 +1,18 @@
 """Every case through every method, in this process's floating-point type."""
 
 import time
-from collections.abc import Iterator
 
 import jax
 import numpy as np
 
-from atlas_cases.case import Case, single
+from atlas_cases.case import single
 from atlas_cases.mechanisms import mechanism
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import FLAGGED, NOT_APPLICABLE, WRONG, Outcome
 from jourdain_jax import DifferentiationModeError, SimulationError
 
 
-def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) -> Iterator[dict]:
+def cells(cases, methods, progress=print):
     """The cells of the atlas, one dictionary each, with the documented keys."""
     dtype = "float32" if single() else "float64"
     for case in cases:
@@ -38,7 +37,7 @@ def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) 
         jax.clear_caches()
 
 
-def _asked(probe, method: Method, tolerance: float) -> Outcome:
+def _asked(probe, method: Method, tolerance) -> Outcome:
     """The method's outcome. An error is a flag; but the engine as it comes must raise its own kind of error,
     any other is a wrong answer that says why.
     """

@@ -2,6 +2,8 @@
 nonlinear in the speeds.
 """
 
+from itertools import pairwise
+
 import equinox as eqx
 import jax.numpy as jnp
 from long_runs_scenes import Point
@@ -9,6 +11,18 @@ from long_runs_scenes import Point
 import jourdain_jax as jj
 
 _TURN = (-3.2, 3.2)
+
+
+class Weighted(jj.Scene):
+    """Under gravity, of 9.81 m/s^2 unless a parameter says otherwise."""
+
+    def loads(self, motion):
+        return jj.gravity(motion, getattr(self, "gravity", 9.81))
+
+
+def downhill(slope):
+    """The direction of gravity in axes of a plane that falls along x."""
+    return jnp.stack([jnp.sin(slope), 0.0, -jnp.cos(slope)])
 
 
 class HeavyAxle(jj.Scene):
@@ -32,14 +46,12 @@ class HeavyAxle(jj.Scene):
         slender = self.axle_mass * (2 * self.half_track) ** 2 / 12
         bodies = {"axle": jj.RigidBody(self.axle_mass, slender * jnp.ones(3), middle, turned)}
         for name, place, spin in (("wheel 1", middle + axle, q.p1), ("wheel 2", middle - axle, q.p2)):
-            bodies[name] = jj.RigidBody.thin_disc(
-                self.wheel_mass, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(spin)
-            )
+            at = {"position": place, "orientation": turned @ jj.rot_y(spin)}
+            bodies[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", **at)
         return bodies
 
     def loads(self, motion):
-        down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
-        return (jj.gravity(motion, self.gravity, down),)
+        return jj.gravity(motion, self.gravity, downhill(self.slope))
 
     def velocity_constraints(self, motion):
         q, u = motion.q, motion.u
@@ -65,42 +77,26 @@ class Edges(jj.Scene):
     domain = {"heading": _TURN}
 
     def bodies(self, t, q):
-        return {
-            "skate": jj.RigidBody(
-                1.0, 0.2 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading)
-            )
-        }
+        return {"skate": jj.RigidBody(1.0, 0.2 * jnp.ones(3), [q.x, q.y, 0.0], jj.rot_z(q.heading))}
 
     def loads(self, motion):
-        return (
-            jj.gravity(
-                motion,
-                9.81,
-                jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)]),
-            ),
-        )
+        return jj.gravity(motion, 9.81, downhill(self.slope))
 
     def velocity_constraints(self, motion):
         skate = motion["skate"]
-        rows = {"edge": jj.knife_edge(skate, skate.position, skate.orientation[:, 1])}
+        edge, second = (
+            jj.knife_edge(skate, skate.position, (skate.orientation @ jj.rot_z(angle))[:, 1])
+            for angle in (0.0, self.angle)
+        )
         if self.copies:
-            return rows | {"copy": rows["edge"], "longer copy": 7.0 * rows["edge"]}
-        return rows | {
-            "second": jj.knife_edge(
-                skate,
-                skate.position,
-                skate.orientation @ jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle), 0.0]),
-            )
-        }
+            return {"edge": edge, "copy": edge, "longer copy": 7.0 * edge}
+        return {"edge": edge, "second": second}
 
 
-class OrthonormalRows(Point):
+class OrthonormalRows(Weighted, Point):
     """A particle in space whose velocity has two orthonormal rows, turned with its coordinate x: equal
     singular values everywhere.
     """
-
-    def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
 
     def velocity_constraints(self, motion):
         frame = jj.rot_z(motion.q.x) @ jj.rot_x(0.7 + motion.q.x)
@@ -117,7 +113,7 @@ class LeadingRow(Point):
         return {"sheet": motion.u.x_rate - motion.q.z * motion.u.y_rate}
 
 
-class AppellHamel(Point):
+class AppellHamel(Weighted, Point):
     """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes,
     with its slope, at rest.
     """
@@ -125,15 +121,12 @@ class AppellHamel(Point):
     k: object = jj.parameter(0.8)
     domain = {"x_rate": (0.2, 1.0), "y_rate": (0.2, 1.0), "z_rate": (-2.0, -0.2)}
 
-    def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
-
     def velocity_constraints(self, motion):
         v = motion["particle"].velocity
         return {"cone": v[0] ** 2 + v[1] ** 2 - (self.k * v[2]) ** 2}
 
 
-class FourBars(jj.Scene):
+class FourBars(Weighted):
     """The n-four-bar linkage: n windows of rods of 1 m and 1 kg, in a vertical plane. Points P0 to Pn hang
     from pivots 1 m apart.
 
@@ -151,47 +144,42 @@ class FourBars(jj.Scene):
     @property
     def domain(self):
         """Near the half circle above the pivots."""
-        return {f"x{i}": (i - 1.0, i + 1.0) for i in range(self.windows + 1)} | {
-            f"z{i}": (0.2, 1.0) for i in range(self.windows + 1)
-        }
+        count = range(self.windows + 1)
+        return {f"x{i}": (i - 1.0, i + 1.0) for i in count} | {f"z{i}": (0.2, 1.0) for i in count}
 
     def _points(self, q):
-        points = [jnp.stack([q[f"x{i}"], 0.0 * q.x0, q[f"z{i}"]]) for i in range(self.windows + 1)]
-        return points, [jnp.array([float(i), 0.0, 0.0]) for i in range(self.windows + 1)]
+        count = range(self.windows + 1)
+        points = [jnp.stack([q[f"x{i}"], 0.0, q[f"z{i}"]]) for i in count]
+        return points, [jnp.array([float(i), 0.0, 0.0]) for i in count]
 
     def bodies(self, t, q):
         points, pivots = self._points(q)
-        bodies = {
-            f"end {i}": jj.Particle((1 + (0 < i < self.windows) + 1.0) / 6, point)
-            for i, point in enumerate(points)
-        }
-        bodies |= {
-            f"crank {i}": jj.Particle(2 / 3, (a + b) / 2)
-            for i, (a, b) in enumerate(zip(points, pivots, strict=True))
-        }
-        return bodies | {
-            f"coupler {i}": jj.Particle(2 / 3, (points[i] + points[i + 1]) / 2) for i in range(self.windows)
-        }
-
-    def loads(self, motion):
-        return (jj.gravity(motion, self.gravity),)
+        bodies = {}
+        for i, (point, pivot) in enumerate(zip(points, pivots, strict=True)):
+            bodies[f"end {i}"] = jj.Particle((2 + (0 < i < self.windows)) / 6, point)
+            bodies[f"crank {i}"] = jj.Particle(2 / 3, (point + pivot) / 2)
+        for i, ends in enumerate(pairwise(points)):
+            bodies[f"coupler {i}"] = jj.Particle(2 / 3, sum(ends) / 2)
+        return bodies
 
     def geometric_constraints(self, pose):
         points, pivots = self._points(pose.q)
         rows = {f"crank {i}": jj.rod(a, b, 1.0) for i, (a, b) in enumerate(zip(pivots, points, strict=True))}
-        return rows | {f"coupler {i}": jj.rod(points[i], points[i + 1], 1.0) for i in range(self.windows)}
+        return rows | {f"coupler {i}": jj.rod(*ends, 1.0) for i, ends in enumerate(pairwise(points))}
 
 
-class Bricard(jj.Scene):
+_VERTICES = ("a", "b", "c", "ai", "bi", "ci")  # "ai": the image of "a"
+_RODS = ("a b", "b c", "a c", "a bi", "b ci", "a ci")
+
+
+class Bricard(Weighted):
     """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis
     of symmetry: z.
     """
 
     lengths: object = jj.parameter((1.0,) * 6, positive=True)
-    domain_near: tuple[float, ...] = eqx.field(static=True, default=())
-    coordinates = jj.coordinates(
-        *(f"{name}{axis}" for name in ("a", "b", "c", "ai", "bi", "ci") for axis in "xyz")
-    )  # "ai": the image of "a"
+    domain_near: tuple = eqx.field(static=True, default=())
+    coordinates = jj.coordinates(*(f"{name}{axis}" for name in _VERTICES for axis in "xyz"))
 
     @property
     def domain(self):
@@ -201,7 +189,7 @@ class Bricard(jj.Scene):
 
     def points(self, q):
         """Places of the vertices, images after their originals."""
-        return dict(zip(("a", "b", "c", "ai", "bi", "ci"), q.array.reshape(6, 3), strict=True))
+        return dict(zip(_VERTICES, q.array.reshape(6, 3), strict=True))
 
     def bodies(self, t, q):
         return {
@@ -209,17 +197,11 @@ class Bricard(jj.Scene):
             for (name, at), mass in zip(self.points(q).items(), (1.0, 1.5, 0.7) * 2, strict=True)
         }
 
-    def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
-
     def geometric_constraints(self, pose):
         points, rows = self.points(pose.q), {}
-        images = {name: name[0] if name.endswith("i") else f"{name}i" for name in points}
-        for (first, second), length in zip(
-            (("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci")),
-            self.lengths,
-            strict=True,
-        ):
-            rows[f"{first}{second}"] = jj.rod(points[first], points[second], length)
-            rows[f"{first}{second} image"] = jj.rod(points[images[first]], points[images[second]], length)
+        images = dict(zip(points, (*_VERTICES[3:], *_VERTICES[:3]), strict=True))
+        for name, length in zip(_RODS, self.lengths, strict=True):
+            ends = name.split()
+            rows[name] = jj.rod(*(points[end] for end in ends), length)
+            rows[f"{name} image"] = jj.rod(*(points[images[end]] for end in ends), length)
         return rows

@@ -5,30 +5,27 @@ contact oscillators, a soft contact.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from long_runs_scenes import Point
 from small_scenes import OnLine
 
 import jourdain_jax as jj
+from atlas_cases.scenes import Weighted
 
 _OMEGA = (-3.0, 3.0)
 
 
-def _turning() -> dict:
+def _turning():
     """The domain of an angular velocity."""
     return {f"attitude_omega_{axis}": _OMEGA for axis in "xyz"}
 
 
-class InSpace(jj.Scene):
+class InSpace(Weighted):
     """A body whose attitude is a quaternion, under gravity."""
 
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def place(self, q):
         """Position and orientation."""
-        return jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude)
-
-    def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude)
 
 
 class CeltInQuaternion(InSpace):
@@ -50,10 +47,10 @@ class CeltInQuaternion(InSpace):
         return {"stone": jj.RigidBody(1.0, inertia, *self.place(q))}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.gravity * self.scale),)
+        return jj.gravity(motion, self.gravity * self.scale)
 
     def _arm(self, down):
-        weighted = self.scale**2 * jnp.array([0.2**2, 0.03**2, 0.02**2]) * down
+        weighted = self.scale**2 * jnp.array([0.2, 0.03, 0.02]) ** 2 * down
         return weighted / jnp.sqrt(down @ weighted) - self.scale * jnp.array([0.0, 0.0, 0.01])
 
     def geometric_constraints(self, pose):
@@ -107,79 +104,19 @@ class DragDisc(InSpace):
     def loads(self, motion):
         disc = motion["disc"]
         axle = disc.orientation[:, 1]
-        up = (
-            jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle
-        )  # of length sin(theta), along the line from the contact to the centre
-        squared = up @ up
+        # of length sin(theta), along the line from the contact to the centre
+        up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle
         # psidot = w . up / sin^2, and M . w = -drag psidot^2
-        return (
-            *super().loads(motion),
-            jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up),
-        )
+        moment = -self.drag * (disc.angular_velocity @ up) / (up @ up) ** 2 * up
+        return super().loads(motion), jj.torque(motion, "disc", moment)
 
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["disc"], 0.3, height="row")}
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        return {
-            "flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps
-        }  # as the model `tilting_disc_quaternion`
-
-
-class ContactOscillator(jj.Scene):
-    """McLachlan and Perlmutter's contact oscillator, `xdot + y zdot = 0`, V = (x^2 + y^2 + z^2)/2 + strength
-    x^2 z^2/2, masses 1 kg.
-
-    With `pairs` = 3 the chaotic one: `xdot + sum y_i zdot_i = 0` and a coupling of x^2 with all z_i^2.
-    """
-
-    strength: object = jj.parameter(0.3)
-    pairs: int = eqx.field(static=True, default=1)
-
-    @property
-    def coordinates(self):
-        """x, y_i and z_i."""
-        return jj.coordinates("x", *(f"y{i} z{i}" for i in range(self.pairs)))
-
-    @property
-    def privileged(self):
-        """All but x."""
-        return tuple(f"{name}{i}_rate" for i in range(self.pairs) for name in "yz")
-
-    def bodies(self, t, q):
-        zero = 0.0 * q.x
-        bodies = {"x": jj.Particle(1.0, jnp.stack([q.x, zero, zero]))}
-        return bodies | {
-            f"pair {i}": jj.Particle(1.0, jnp.stack([zero, q[f"y{i}"], q[f"z{i}"]]))
-            for i in range(self.pairs)
-        }
-
-    def potential(self, pose):
-        q = pose.q
-        squares = sum(q[f"z{i}"] ** 2 for i in range(self.pairs))
-        return (q.array @ q.array + self.strength * q.x**2 * squares) / 2
-
-    def velocity_constraints(self, motion):
-        q, u = motion.q, motion.u
-        return {"contact": u.x_rate + sum(q[f"y{i}"] * u[f"z{i}_rate"] for i in range(self.pairs))}
-
-
-class PendulumDrivenGear(Point):
-    """A continuously variable transmission: a driver y, on its own, sets the ratio between two oscillators,
-    `xdot + f(y) zdot = 0`.
-
-    f(y) = 1 + sin(y), which is neither even nor odd; V = 1 - cos(y) + y/5 + (x^2 + z^2)/2; masses 1 kg.
-    """
-
-    privileged = ("y_rate", "z_rate")
-
-    def potential(self, pose):
-        q = pose.q
-        return 1 - jnp.cos(q.y) + 0.2 * q.y + (q.x**2 + q.z**2) / 2
-
-    def velocity_constraints(self, motion):
-        return {"gear": motion.u.x_rate + (1 + jnp.sin(motion.q.y)) * motion.u.z_rate}
+        # as the model `tilting_disc_quaternion`
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps}
 
 
 class SteepEdge(OnLine):
@@ -204,19 +141,15 @@ class SoftWheel(jj.Scene):
 
     def bodies(self, t, q):
         turned = jj.rot_z(q.heading) @ jj.rot_y(q.roll)
-        return {"disc": jj.RigidBody(1.0, jnp.ones(3), jnp.stack([q.x, q.y, q.z]), turned)}
+        return {"disc": jj.RigidBody(1.0, jnp.ones(3), [q.x, q.y, q.z], turned)}
 
     def loads(self, motion):
         disc, q, u, k = motion["disc"], motion.q, motion.u, self.stiffness
         contact = jnp.array([0.0, 0.0, -1.0])
         slip = disc.velocity + jnp.cross(disc.angular_velocity, contact)
         normal = k * (1.0 - q.z) + 9.81 - 0.1 * jnp.sqrt(k) * u.z_rate
-        return (
-            jj.gravity(motion, 9.81),
-            jj.point_force(
-                disc.point(disc.orientation.T @ contact), jnp.stack([-k * slip[0], -k * slip[1], normal])
-            ),
-        )
+        force = jnp.stack([-k * slip[0], -k * slip[1], normal])
+        return jj.gravity(motion, 9.81), jj.point_force(disc.point(disc.orientation.T @ contact), force)
 
 
 class SwitchedTurntable(jj.Scene):
@@ -227,19 +160,10 @@ class SwitchedTurntable(jj.Scene):
     coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {
-            "ball": jj.RigidBody.ball(
-                1.0,
-                0.05,
-                position=jnp.stack([q.x, q.y, 0.05 + 0.0 * q.x]),
-                orientation=jj.quaternion_to_matrix(q.attitude),
-            )
-        }
+        attitude = jj.quaternion_to_matrix(q.attitude)
+        return {"ball": jj.RigidBody.ball(1.0, 0.05, position=[q.x, q.y, 0.05], orientation=attitude)}
 
     def contacts(self, pose):
         turning = -2.0 * jnp.tanh(3.0 * (pose.t - 1.0))
-        return {
-            "table": jj.ball_contact(
-                pose["ball"], 0.05, ground=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0]))
-            )
-        }
+        table = jj.Plane(angular_velocity=jnp.stack([0.0, 0.0, turning]))
+        return {"table": jj.ball_contact(pose["ball"], 0.05, ground=table)}

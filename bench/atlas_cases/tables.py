@@ -1,115 +1,97 @@
-"""The tables behind the picture (CSV and Markdown), and the figures of the default path."""
+"""The tables behind the picture, in Markdown, and the figures of the default path."""
 
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
+
+from figures import markdown
 
 from atlas_cases.cases import CASES
 from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, OUTCOMES, RIGHT, STALLED, WRONG
 
 TITLE = "# The atlas: outcomes by method and by case\n\nWritten by `python bench/atlas.py --out DIR`.\n"
+SHOWN = (RIGHT, FLAGGED, WRONG, NAN, STALLED)
 
 
-def write_tables(cells: list[dict], out: Path) -> None:
+def write_tables(cells, out):
     """Write `atlas_tables.md`: outcomes by method, by case, and the reasons of failures."""
     written = "\n".join([TITLE, *by_method(cells), "", *by_case(cells), "", *_reasons(cells), ""])
     (out / "atlas_tables.md").write_text(written, encoding="utf-8")
 
 
-SHOWN = (RIGHT, FLAGGED, WRONG, NAN, STALLED)
+def _different(cells, key):
+    return list(dict.fromkeys(cell[key] for cell in cells))
 
 
-def _types(cells) -> list[str]:
-    return list(dict.fromkeys(cell["dtype"] for cell in cells))
+def _where(cells, **keys):
+    return [cell for cell in cells if all(cell[key] == value for key, value in keys.items())]
 
 
-def _counts(cells, dtype: str) -> Counter:
-    return Counter(cell["outcome"] for cell in cells if cell["dtype"] == dtype)
+def _counts(cells) -> Counter:
+    return Counter(cell["outcome"] for cell in cells)
 
 
-def by_method(cells: list[dict]) -> Iterator[str]:
+def by_method(cells):
     """How often each method was right, flagged, ..., and in how many cases it was asked."""
-    types = _types(cells)
-    yield from (
-        "## Outcomes by method",
-        "",
-        "| method | " + " | ".join(f"{dtype}: asked | " + " | ".join(SHOWN) for dtype in types) + " |",
-    )
-    yield "|---|" + "---|" * (len(types) * (1 + len(SHOWN)))
-    for method in dict.fromkeys(cell["method"] for cell in cells):
-        counts = [_counts([cell for cell in cells if cell["method"] == method], dtype) for dtype in types]
-        yield (
-            f"| {method} | "
-            + " | ".join(
-                f"{sum(c[o] for o in SHOWN)} | " + " | ".join(str(c[o] or "") for o in SHOWN) for c in counts
-            )
-            + " |"
-        )
+    types, rows = _different(cells, "dtype"), []
+    for method in _different(cells, "method"):
+        row = [method]
+        for dtype in types:
+            counts = _counts(_where(cells, method=method, dtype=dtype))
+            row += [sum(counts[o] for o in SHOWN), *(counts[o] or "" for o in SHOWN)]
+        rows.append(row)
+    head = ["method", *(name for dtype in types for name in (f"{dtype}: asked", *SHOWN))]
+    return ["## Outcomes by method", "", *markdown(head, rows)]
 
 
-def by_case(cells: list[dict]) -> Iterator[str]:
+def by_case(cells):
     """What the engine as it comes makes of each case, and how many of the other methods are right, flagged,
     ....
     """
-    types, titles = _types(cells), {case.name: case.title for case in CASES}
-    yield from ("## Outcomes by case", "", "Other methods: " + " / ".join(SHOWN) + ".", "")
-    yield "| case | what | " + " | ".join(f"tolerance, {dtype} | default | others" for dtype in types) + " |"
-    yield "|---|---|" + "---|" * (3 * len(types))
-    for name in dict.fromkeys(cell["case"] for cell in cells):
-        here = [cell for cell in cells if cell["case"] == name]
-        shown = []
+    types, titles, rows = _different(cells, "dtype"), {case.name: case.title for case in CASES}, []
+    for name in _different(cells, "case"):
+        row = [name, titles[name]]
         for dtype in types:
-            default = next(
-                (cell for cell in here if cell["method"] == "default" and cell["dtype"] == dtype), None
-            )
-            counts = _counts([cell for cell in here if cell["method"] != "default"], dtype)
-            tolerance = next(cell["tolerance"] for cell in here if cell["dtype"] == dtype)
-            shown += [
-                f"{tolerance:.0e}" if tolerance else "a flag",
-                _in_words(default),
-                " / ".join(str(counts[outcome]) for outcome in SHOWN),
-            ]
-        yield f"| {name} | {titles[name]} | " + " | ".join(shown) + " |"
+            here = _where(cells, case=name, dtype=dtype)
+            default = _where(here, method="default")
+            counts = _counts(here) - _counts(default)
+            tolerance = here[0]["tolerance"]
+            row.append(f"{tolerance:.0e}" if tolerance else "a flag")
+            row += ["".join(map(_in_words, default)), " / ".join(str(counts[outcome]) for outcome in SHOWN)]
+        rows.append(row)
+    head = ["case", "what", *(x for dtype in types for x in (f"tolerance, {dtype}", "default", "others"))]
+    about = f"Other methods: {' / '.join(SHOWN)}."
+    return ["## Outcomes by case", "", about, "", *markdown(head, rows)]
 
 
-def _in_words(cell) -> str:
-    if cell is None or cell["outcome"] == NOT_APPLICABLE:
-        return ""
-    return (
-        f"{cell['outcome']}, {cell['error']:.0e}"
-        if cell["outcome"] in (RIGHT, WRONG) and cell["error"] is not None
-        else cell["outcome"]
-    )
+def _in_words(cell):
+    outcome, error = cell["outcome"], cell["error"]
+    if outcome in (RIGHT, WRONG) and error is not None:
+        return f"{outcome}, {error:.0e}"
+    return "" if outcome == NOT_APPLICABLE else outcome
 
 
-def _reasons(cells) -> Iterator[str]:
+def _reasons(cells):
     """Every mechanism once, without a method's own words (in brackets), with the methods and the cases for
     which it was the reason.
     """
-    yield from ("## Why methods fail", "", "| mechanism | methods | cases |", "|---|---|---|")
-    found: dict[str, tuple[dict, dict]] = {}
+    found = {}
     for cell in cells:
         if cell["outcome"] not in (RIGHT, NOT_APPLICABLE):
             methods, cases = found.setdefault(cell["mechanism"].partition(" [")[0], ({}, {}))
             methods[cell["method"]] = cases[cell["case"]] = None
-    for mechanism, (methods, cases) in found.items():
-        yield f"| {mechanism} | {', '.join(methods)} | {', '.join(cases)} |"
+    rows = [(mechanism, *map(", ".join, names)) for mechanism, names in found.items()]
+    return ["## Why methods fail", "", *markdown(("mechanism", "methods", "cases"), rows)]
 
 
-def summary(cells: list[dict]) -> str:
+def summary(cells):
     """Counts by method, and what the default path fails at."""
     lines = []
-    for method in dict.fromkeys(cell["method"] for cell in cells):
-        counts = Counter(cell["outcome"] for cell in cells if cell["method"] == method)
+    for method in _different(cells, "method"):
+        counts = _counts(_where(cells, method=method))
         lines.append(f"{method:22s} " + ", ".join(f"{counts[o]} {o}" for o in OUTCOMES if counts[o]))
     must = {case.name for case in CASES if case.must_be_right}
-    for cell in cells:
-        engine = cell["method"] in ("default", "rollout")
+    for cell in _where(cells, method="default") + _where(cells, method="rollout"):
         required = cell["method"] == "default" and cell["dtype"] == "float64" and cell["case"] in must
-        lost = cell["outcome"] in (WRONG, NAN, STALLED) or (required and cell["outcome"] == FLAGGED)
-        if engine and lost:
-            lines.append(
-                f"MARK MISSED: {cell['method']} in {cell['case']} ({cell['dtype']}): {cell['outcome']}"
-                f" {cell['error']} {cell['mechanism']}"
-            )
+        if cell["outcome"] in (WRONG, NAN, STALLED) or (required and cell["outcome"] == FLAGGED):
+            told = "MARK MISSED: {method} in {case} ({dtype}): {outcome} {error} {mechanism}"
+            lines.append(told.format(**cell))
     return "\n".join(lines)

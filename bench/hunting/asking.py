@@ -21,51 +21,35 @@ class Failed:
     said: str
 
 
-def tolerance(ask: Ask) -> float:
+def tolerance(ask: Ask):
     """That which is asked for in this process's floats."""
     return ask.rtol if jax.config.jax_enable_x64 else max(ask.rtol, 1e-5)
 
 
-def ask_for(family: Family, ask: Ask, numbers: list[dict], ts: np.ndarray) -> list:
+def ask_for(family: Family, ask: Ask, numbers, ts):
     """A `Trajectory` (as numbers) or `Failed` for every case."""
     rtol = tolerance(ask)
 
-    def options(numbers: dict) -> dict:
-        size = {name: numbers[name] for name in ("atol", "t0") if name in numbers}
-        return (
-            {"t0": 0.0, "rtol": rtol, "atol": rtol, "retry": True, "events": True}
-            | ask.options
-            | family.given_inputs(numbers)
-            | size
-        )
+    def options(numbers):
+        own = {name: numbers[name] for name in ("atol", "t0") if name in numbers}
+        usual = {"t0": 0.0, "rtol": rtol, "atol": rtol, "retry": True, "events": True}
+        return usual | ask.options | family.given_inputs(numbers) | own
 
-    def motion(numbers: dict, ts):
-        return jj.simulate(
-            family.scene().replace(**family.parameters(numbers)),
-            family.begin(numbers),
-            ts=ts,
-            **options(numbers),
-        )
+    def motion(numbers, ts):
+        scene = family.scene().replace(**family.parameters(numbers))
+        return jj.simulate(scene, family.begin(numbers), ts=ts, **options(numbers))
 
-    def lanes(many: dict):
-        return jj.rollout(
-            family.scene(),
-            family.begin(many),
-            parameters=family.parameters(many) or None,
-            ts=ts[0],
-            **options(numbers[0]),
-        ).lanes
+    def lanes(many):
+        own = {"parameters": family.parameters(many) or None, "ts": ts[0]} | options(numbers[0])
+        return jj.rollout(family.scene(), family.begin(many), **own).lanes
 
-    many = {name: jnp.asarray(value) for name, value in together(numbers).items()}
-    one_by_one = {"simulate": motion, "jit": jax.jit(motion)}
-    if ask.way in one_by_one:
-        given = (
-            numbers
-            if ask.way == "simulate"
-            else [{k: jnp.asarray(v) for k, v in one.items()} for one in numbers]
-        )
-        rows = ts if ask.way == "simulate" else jnp.asarray(ts)
-        return [_caught(one_by_one[ask.way], *case) for case in zip(given, rows, strict=True)]
+    if ask.way == "simulate":
+        return [_caught(motion, *case) for case in zip(numbers, ts, strict=True)]
+    if ask.way == "jit":
+        cases = jax.tree.map(jnp.asarray, [*zip(numbers, ts, strict=True)])
+        compiled = jax.jit(motion)
+        return [_caught(compiled, *case) for case in cases]
+    many = jax.tree.map(jnp.asarray, together(numbers))
     batched = {
         "vmap": lambda many: jax.jit(jax.vmap(motion))(many, jnp.asarray(ts)),
         "rollout": lanes,

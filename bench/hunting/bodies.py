@@ -23,14 +23,11 @@ class Top(jj.Scene):
 
     def bodies(self, t, q):
         frame = jj.quaternion_to_matrix(q.attitude)
-        return {
-            "top": jj.RigidBody(
-                1.0, jnp.stack([self.i1 - 0.01, self.i2 - 0.01, self.i3]), 0.1 * frame[:, 2], frame
-            )
-        }
+        moments = jnp.stack([self.i1 - 0.01, self.i2 - 0.01, self.i3])
+        return {"top": jj.RigidBody(1.0, moments, 0.1 * frame[:, 2], frame)}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.weight / 0.1),)
+        return jj.gravity(motion, self.weight / 0.1)
 
 
 def _top_truth(n, ts):
@@ -55,12 +52,7 @@ ATTITUDE = "attitude_w attitude_x attitude_y attitude_z"
 
 
 def _top_start(n):
-    turned = {
-        "attitude_w": jnp.cos(n.tilt / 2),
-        "attitude_x": jnp.sin(n.tilt / 2),
-        "attitude_y": 0.0,
-        "attitude_z": 0.0,
-    }
+    turned = {"attitude_w": jnp.cos(n.tilt / 2), "attitude_x": jnp.sin(n.tilt / 2)}
     return turned | {speed: getattr(n, name) for name, speed in OMEGA.items()}
 
 
@@ -93,7 +85,7 @@ class Robot(Weighted):
 
     def bodies(self, t, q):
         frame, r = jj.rot_z(q.heading), jnp.asarray(self.radius)
-        axle = jnp.stack([q.x, q.y, r + 0.0 * q.x])
+        axle = jnp.stack([q.x, q.y, r])
         side = self.half * frame[:, 1]
         wheel = lambda place, spin: jj.RigidBody.thin_disc(
             self.wheel, r, axis="y", position=place, orientation=frame @ jj.rot_y(spin)
@@ -106,7 +98,7 @@ class Robot(Weighted):
 
     def loads(self, motion):
         push = {"left_rate": motion.inputs.tau_left, "right_rate": motion.inputs.tau_right}
-        return *super().loads(motion), jj.generalized_force(motion, **push)
+        return super().loads(motion), jj.generalized_force(motion, **push)
 
 
 class RobotAhead(Robot):
@@ -192,16 +184,9 @@ def _disc_truth(n, ts):
         # as in the oracle with theta = lean + pi/2, cot(theta) = -tan(lean), w3 there = -w3 here
         dw1 = (-A * w2**2 * tan + (C + ring) * w2 * w3 + m * G * a * np.sin(lean)) / (A + ring)
         dw2 = w1 * (-C * w3 + A * w2 * tan) / A
-        return (
-            a * rolling * np.cos(yaw),
-            a * rolling * np.sin(yaw),
-            turn,
-            w1,
-            rolling,
-            dw1,
-            dw2,
-            -ring * w1 * w2 / (C + ring),
-        )
+        forward = a * rolling
+        angles = forward * np.cos(yaw), forward * np.sin(yaw), turn, w1, rolling
+        return *angles, dw1, dw2, -ring * w1 * w2 / (C + ring)
 
     speeds = n.lean_rate, n.yaw_rate * np.cos(n.lean), n.spin_rate + n.yaw_rate * np.sin(n.lean)
     return integrate(rates, (0.0, 0.0, 0.0, n.lean, 0.0, *speeds), ts, width=0.03)[:5]
@@ -220,14 +205,8 @@ class CarriedPendulum(Weighted):
 
     def bob(self, place, q):
         """The body, with the cart at a place."""
-        return {
-            "bob": jj.Particle(
-                1.0,
-                jnp.stack(
-                    [place + self.length * jnp.sin(q.angle), 0.0 * q.angle, -self.length * jnp.cos(q.angle)]
-                ),
-            )
-        }
+        bob = [place + self.length * jnp.sin(q.angle), 0.0, -self.length * jnp.cos(q.angle)]
+        return {"bob": jj.Particle(1.0, bob)}
 
     def bodies(self, t, q):
         return self.bob(self.cart(t), q)

@@ -9,10 +9,9 @@ from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, G, Truth, drawn, either, one_of
+from hunting.family import Ask, Family, G, drawn, either, one_by_one, one_of, piece
 
 MOST = 200
 LEAST_REBOUND = 1e-6  # m/s: slower rebounds are left out here; the engine sums them
@@ -36,34 +35,20 @@ class Eccentric(jj.Scene):
 
     def bodies(self, t, q):
         R = jj.rot_y(q.turn)
-        centre = jnp.stack([q.x, 0.0 * q.x, q.z])
-        I = self.gyration**2 * jnp.diag(jnp.array([0.5, 1.0, 0.5]))
-        return {
-            "disc": jj.RigidBody(
-                1.0, I, centre + R @ jnp.stack([0.0 * q.x, 0.0 * q.x, self.offset + 0.0 * q.x]), R
-            )
-        }
+        place = jnp.stack([q.x, 0.0, q.z]) + self.offset * R[:, 2]
+        return {"disc": jj.RigidBody(1.0, self.gyration**2 * jnp.array([0.5, 1.0, 0.5]), place, R)}
 
     def loads(self, motion):
-        down = jnp.stack([jnp.sin(self.slope), 0.0 * self.slope, -jnp.cos(self.slope)])
+        down = jnp.stack([jnp.sin(self.slope), 0.0, -jnp.cos(self.slope)])
         push = jj.generalized_force(
             motion, x_rate=self.push * jnp.sin(3 * motion.t), turn_rate=self.torque * jnp.cos(2 * motion.t)
         )
-        return (jj.gravity(motion, G, down), push)
+        return jj.gravity(motion, G, down), push
 
     def contacts(self, pose):
-        disc, centre = pose["disc"], jnp.stack([0.0 * self.offset, 0.0 * self.offset, -self.offset])
-        return {
-            "rim": jj.disc_contact(
-                disc,
-                self.radius,
-                centre=centre,
-                height="row",
-                friction=self.friction,
-                restitution=self.bounce,
-                impact=self.impact,
-            )
-        }
+        law = {"friction": self.friction, "restitution": self.bounce, "impact": self.impact}
+        centre = jnp.stack([0.0, 0.0, -self.offset])
+        return {"rim": jj.disc_contact(pose["disc"], self.radius, centre=centre, height="row", **law)}
 
 
 class _Disc:
@@ -71,7 +56,7 @@ class _Disc:
 
     def __init__(self, n, impact):
         self.n, self.impact = n, impact
-        self.T, self.N = np.array([1.0, 0.0, -n.radius]), np.array([0.0, 1.0, 0.0])
+        self.rows = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, -n.radius]])  # of the gap and of slip
 
     def equations(self, t, y):
         n, (c, s), w = self.n, (np.cos(y[2]), np.sin(y[2])), y[5]
@@ -94,9 +79,8 @@ class _Disc:
         M, f = self.equations(t, y)
         if mode == FLIES:
             return np.linalg.solve(M, f), 0.0, 0.0
-        rows = np.array([self.N, self.T])
-        pulls = rows.T if mode == ROLLS else (self.N - self.n.friction * side * self.T)[:, None]
-        held = rows if mode == ROLLS else rows[:1]
+        held = self.rows if mode == ROLLS else self.rows[:1]
+        pulls = held.T if mode == ROLLS else self.rows.T @ [[1.0], [-self.n.friction * side]]
         K = np.block([[M, -pulls], [held, np.zeros((len(held), pulls.shape[1]))]])
         a = np.linalg.solve(K, np.concatenate([f, np.zeros(len(held))]))
         normal = a[3]
@@ -152,9 +136,8 @@ class _Disc:
 
     def response(self, t, y):
         M, f = self.equations(t, y)
-        rows = np.array([self.N, self.T])
-        X = np.linalg.solve(M, rows.T)
-        return X, rows @ X, rows @ np.linalg.solve(M, f), rows @ y[3:]
+        X = np.linalg.solve(M, self.rows.T)
+        return X, self.rows @ X, self.rows @ np.linalg.solve(M, f), self.rows @ y[3:]
 
     def settled(self, t, y):
         """Mode and side of a closed contact at rest."""
@@ -167,17 +150,16 @@ class _Disc:
     def closed(self, t, y):
         """State, mode and side after the gap has closed."""
         X, G, _, w = self.response(t, y)
-        rebound = -self.n.bounce * w[0]
+        rebounds = -self.n.bounce * w[0] > LEAST_REBOUND
+        bounce = self.n.bounce if rebounds else 0.0
         if self.impact == "moreau":
-            L, side = self.law(G, w, rebound if rebound > LEAST_REBOUND else 0.0)
+            L, side = self.law(G, w, -bounce * w[0])
         else:
-            L, side = self.along_the_impulse(G, w, self.n.bounce if rebound > LEAST_REBOUND else 0.0)
-        if L @ (w + G @ L / 2) > 1e-9 * abs(L @ w):  # it gains energy
+            L, side = self.along_the_impulse(G, w, bounce)
+        if np.isnan(side) or L @ (w + G @ L / 2) > 1e-9 * abs(L @ w):  # it gains energy
             raise FloatingPointError
         y = np.concatenate([y[:3], y[3:] + X @ L])
-        if np.isnan(side):
-            raise FloatingPointError
-        if rebound > LEAST_REBOUND:
+        if rebounds:
             return y, FLIES, 0.0
         slip = w[1] + (G @ L)[1]
         if side != 0 and abs(slip) > 1e-9:
@@ -221,37 +203,18 @@ def _phase(disc, t, y, mode, side, end):
         if mode == ROLLS:
             _, normal, tangential = disc.forces(t, y, mode, side)
             return disc.n.friction * normal - abs(tangential)
-        return side * (disc.T @ y[3:]) if mode == SLIPS else 1.0
+        return side * (disc.rows[1] @ y[3:]) if mode == SLIPS else 1.0
 
-    def run(t, y, end, *events):
-        for event in events:
-            event.terminal, event.direction = True, -1
-        return solve_ivp(
-            rates,
-            (t, end),
-            y,
-            "DOP853",
-            rtol=1e-12,
-            atol=1e-13,
-            max_step=0.02,
-            events=events or None,
-            dense_output=True,
-        )
-
+    leaves.direction = slides.direction = -1
     if (
         mode == FLIES and y[1] - disc.n.radius < 1e-9
     ):  # from the ground: the first half of a flight has no event
         falls = -disc.forces(t, y, FLIES, 0.0)[0][1]
         half = min(y[4] / falls if falls > 0 and y[4] > 0 else 1e-4, 1e-3, end - t)
-        yield (first := run(t, y, t + half))
+        yield (first := piece(rates, t, y, t + half))
         t, y = first.t[-1], first.y[:, -1]
     if t < end:
-        yield run(t, y, end, leaves, slides)
-
-
-def _truth(impact, n, ts):
-    cases = [type(n)(**{name: value[i, 0] for name, value in vars(n).items()}) for i in range(len(ts))]
-    return Truth(np.stack([_followed(one, own, impact) for one, own in zip(cases, ts, strict=True)]))
+        yield piece(rates, t, y, end, [leaves, slides])
 
 
 WAYS = ("simulate", "jit", "vmap", "rollout")
@@ -260,7 +223,7 @@ FAMILIES = tuple(
     Family(
         name="friction" if law == "moreau" else f"friction {law}", what=f"{WHAT}; impacts: {law}",
         scene=type(law, (Eccentric,), {"impact": law}),
-        truth=partial(_truth, law),
+        truth=one_by_one(partial(_followed, impact=law)),
         names="x z turn x_rate z_rate turn_rate",
         draw=drawn(
             radius=(0.2, 0.4), offset=one_of(0.0, (0.0, 0.1)), gyration=(0.1, 0.3),

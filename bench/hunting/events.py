@@ -23,7 +23,7 @@ class Room(Weighted, Upright):
         return {"floor": q.z, "ceiling": self.height - q.z, "back wall": q.x + 1.0, "wall": self.width - q.x}
 
 
-def _earliest(candidates: dict[str, np.ndarray], span) -> tuple[np.ndarray, list[str]]:
+def _earliest(candidates, span):
     """Time (cases, 1) and name of the first of the events; the span and "" where none comes."""
     names, times = list(candidates), np.concatenate(list(candidates.values()), axis=1)
     first = np.min(times, axis=1, keepdims=True)
@@ -55,17 +55,11 @@ def _room_truth(n, ts):
     )
 
 
-def _grazing_drawn(r):
-    """Its path passes the ceiling by a little, for a short time; nothing else is near."""
-    vz, over = r.uniform(3.0, 7.0), 10 ** r.uniform(-3.5, -0.5)
-    return {
-        "z": 1.0,
-        "x_rate": r.uniform(0.1, 0.3),
-        "z_rate": vz,
-        "width": 3.0,
-        "height": 1.0 + vz**2 / (2 * G) - over,
-        "span": 2.1 * vz / G,
-    }
+# Its path passes the ceiling by a little, for a short time; nothing else is near.
+GRAZING = drawn(
+    z_rate=(3.0, 7.0), height=lambda r, n: 1.0 + n.z_rate**2 / (2 * G) - 10 ** r.uniform(-3.5, -0.5), z=1.0,
+    x_rate=(0.1, 0.3), width=3.0, span=lambda r, n: 2.1 * n.z_rate / G,
+)  # fmt: skip
 
 
 class Spring(OnLine):
@@ -75,7 +69,7 @@ class Spring(OnLine):
     stop: object = jj.parameter(1.0, positive=True)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.k * motion.q.x),)
+        return jj.generalized_force(motion, x_rate=-self.k * motion.q.x)
 
     def left(self, x):
         """The value of the event, which falls through zero."""
@@ -126,11 +120,8 @@ class StiffDrop(OnPlane):
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (
-            jj.generalized_force(
-                motion, x_rate=-self.k * (q.x - jnp.sin(q.y)) - self.k * u.x_rate, y_rate=-1.0 + 0.0 * q.y
-            ),
-        )
+        drawn = -self.k * (q.x - jnp.sin(q.y)) - self.k * u.x_rate
+        return jj.generalized_force(motion, x_rate=drawn, y_rate=-1.0)
 
     def events(self, motion):
         return {"floor": motion.q.y}
@@ -190,7 +181,7 @@ FAMILIES = (
         **ROOM, cases=140,
     ),
     Family(
-        name="grazing", what="a ceiling that is passed by a little for a short time", draw=_grazing_drawn,
+        name="grazing", what="a ceiling that is passed by a little for a short time", draw=GRAZING,
         **ROOM,
     ),
     Family(name="stop", what="an oscillator that meets a stop", scene=Spring, **STOP),

@@ -31,7 +31,7 @@ FAMILIES = (
 )
 
 
-def family(name: str):
+def family(name):
     """The family with this name; ValueError where there is none."""
     for found in FAMILIES:
         if found.name == name:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 G = 9.81  # m/s^2
 
@@ -23,17 +24,17 @@ class Truth:
     event: list[str] | None = None  # by case; "": none
 
     @property
-    def last(self) -> np.ndarray:
+    def last(self):
         """Values at the end."""
         return self.values[:, -1] if self.end is None else self.end
 
 
-def columns(*values) -> np.ndarray:
+def columns(*values):
     """Arrays (cases, times) of names side by side, (cases, times, names)."""
     return np.stack(np.broadcast_arrays(*values), axis=-1)
 
 
-def stopped(values_at: Callable, t_end, event: list[str], ts) -> Truth:
+def stopped(values_at, t_end, event, ts) -> Truth:
     """Values at the saved times up to the end (cases, 1), NaN after it."""
     reached = ts <= t_end * (1 + 1e-12)
     return Truth(
@@ -53,7 +54,7 @@ class Ask:
     rtol: float = 1e-8
     options: dict = field(default_factory=dict)  # of `simulate`
 
-    def __str__(self) -> str:
+    def __str__(self):
         more = "".join(f", {name}={value}" for name, value in self.options.items())
         return f"{self.way}, {self.times} times, rtol={self.rtol:g}{more}"
 
@@ -70,29 +71,34 @@ SOME = (
 FEW = SOME[:4]  # of scenes that take long to build
 
 
-def either(low: float, high: float) -> Callable:
+def either(low, high):
     """A number of either sign."""
-    return lambda r: r.choice([-1.0, 1.0]) * r.uniform(low, high)
+    return lambda r, n: r.choice([-1.0, 1.0]) * r.uniform(low, high)
 
 
-def one_of(*values) -> Callable:
+def one_of(*values):
     """One of some numbers, or of pairs between which one is drawn."""
-    return lambda r: r.choice([r.uniform(*x) if isinstance(x, tuple) else x for x in values])
+    return lambda r, n: r.choice([r.uniform(*x) if isinstance(x, tuple) else x for x in values])
 
 
-def power(low: float, high: float) -> Callable:
+def power(low, high):
     """Ten to a power between these."""
-    return lambda r: 10 ** r.uniform(low, high)
+    return lambda r, n: 10 ** r.uniform(low, high)
 
 
-def drawn(**numbers) -> Callable:
-    """Numbers one after another: between the two of a pair, by a function of the generator, or as they
-    are.
+def drawn(**numbers):
+    """Numbers one after another: between the two of a pair, by a function of the generator and of those
+    before, or as they are.
     """
-    return lambda r: {
-        name: float(r.uniform(*x) if isinstance(x, tuple) else x(r) if callable(x) else x)
-        for name, x in numbers.items()
-    }
+
+    def draw(r):
+        n = SimpleNamespace()
+        for name, x in numbers.items():
+            value = r.uniform(*x) if isinstance(x, tuple) else x(r, n) if callable(x) else x
+            setattr(n, name, float(value))
+        return vars(n)
+
+    return draw
 
 
 @dataclass(frozen=True)
@@ -106,33 +112,23 @@ class Family:
 
     name: str
     what: str  # in words
-    scene: Callable[[], object]
-    draw: Callable[[np.random.Generator], dict[str, float]]
-    truth: Callable[
-        [SimpleNamespace, np.ndarray], tuple | Truth
-    ]  # numbers (cases, 1), ts (cases, times) -> values of `names`, or all of it
+    scene: Callable
+    draw: Callable  # generator -> numbers by name
+    truth: Callable  # numbers (cases, 1), ts (cases, times) -> values of `names`, or a `Truth`
     names: str  # coordinates and speeds that are compared
-    start: Callable[[SimpleNamespace], dict] = (
-        lambda n: {}
-    )  # further start values; coordinates without one are zero
-    inputs: Callable[[SimpleNamespace], dict] | None = None
-    times: Callable[[SimpleNamespace, int], np.ndarray] | None = (
-        None  # numbers of one case, count -> ts; default: even ones
-    )
+    start: Callable = lambda n: {}  # further start values; coordinates without one are zero
+    inputs: Callable | None = None  # numbers -> inputs
+    times: Callable | None = None  # numbers of one case, count -> ts; default: even ones
     asks: tuple[Ask, ...] = SOME
     cases: int = 70  # of a full search, in proportion
     shared: tuple[str, ...] = ("span", "t0")  # numbers that the lanes of a rollout have in common
-    fixed: tuple[str, ...] = (
-        "span",
-        "t0",
-    )  # numbers that are not varied to see how much a motion amplifies errors
+    # numbers that are not varied to see how much a motion amplifies errors
+    fixed: tuple[str, ...] = ("span", "t0")
     slack: float = 1.0
-    size: Callable[[SimpleNamespace], tuple] | None = (
-        None  # numbers -> of what counts as small in each name; default 1
-    )
+    size: Callable | None = None  # numbers -> of what counts as small in each name; default 1
     single: bool = True  # whether it is asked in float32, too
 
-    def numbers(self, seed: int, single: bool = False) -> tuple[Ask, dict[str, float]]:
+    def numbers(self, seed, single=False):
         """What is asked in the case with this seed, and its numbers."""
         ask = self.asks[seed % len(self.asks)]
         numbers = self.draw(np.random.default_rng([seed, 77]))
@@ -143,46 +139,72 @@ class Family:
             numbers = {name: float(np.float32(value)) for name, value in numbers.items()}
         return ask, numbers
 
-    def run(self, seeds: list[int]):
+    def run(self, seeds):
         """Records of the cases with these seeds."""
         from hunting.judging import search
 
         return search(self, seeds)
 
-    def parameters(self, numbers: dict) -> dict:
+    def parameters(self, numbers):
         """Values of the scene's parameters."""
         fields = self.scene().__dataclass_fields__
         return {name: value for name, value in numbers.items() if name in fields}
 
-    def begin(self, numbers: dict) -> dict:
+    def begin(self, numbers):
         """Values at the start, each as long as the numbers."""
-        coordinates, speeds = self.scene().coordinate_names.entries, self.scene().speed_names.entries
-        given = dict.fromkeys(coordinates, 0.0) | {
-            name: numbers[name] for name in (*coordinates, *speeds) if name in numbers
-        }
-        return {
-            name: value + 0.0 * numbers["span"]
-            for name, value in (given | self.start(SimpleNamespace(**numbers))).items()
-        }
+        scene = self.scene()
+        coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
+        given = dict.fromkeys(coordinates, 0.0)
+        given |= {name: numbers[name] for name in (*coordinates, *speeds) if name in numbers}
+        given |= self.start(SimpleNamespace(**numbers))
+        return {name: value + 0.0 * numbers["span"] for name, value in given.items()}
 
-    def given_inputs(self, numbers: dict) -> dict:
+    def given_inputs(self, numbers):
         """The option `inputs` of `simulate`, where there are any."""
         return {} if self.inputs is None else {"inputs": self.inputs(SimpleNamespace(**numbers))}
 
-    def right(self, numbers: dict[str, np.ndarray], ts: np.ndarray) -> Truth:
+    def right(self, numbers, ts) -> Truth:
         """The truth of cases whose numbers are arrays."""
-        found = self.truth(
-            SimpleNamespace(**{name: np.asarray(value)[:, None] for name, value in numbers.items()}), ts
-        )
+        rows = {name: np.asarray(value)[:, None] for name, value in numbers.items()}
+        found = self.truth(SimpleNamespace(**rows), ts)
         return found if isinstance(found, Truth) else Truth(columns(*found))
 
-    def saved(self, ask: Ask, numbers: dict, single: bool = False) -> np.ndarray:
+    def saved(self, ask: Ask, numbers, single=False):
         """Times to save at; what they are after rounding to the engine's floats."""
         even = numbers.get("t0", 0.0) + numbers["span"] * np.arange(1, ask.times + 1) / ask.times
         ts = self.times(SimpleNamespace(**numbers), ask.times) if self.times else even
         return np.asarray(ts, np.float32 if single else float).astype(float)
 
 
-def together(numbers: list[dict]) -> dict[str, np.ndarray]:
+def one_by_one(follow):
+    """The truth of cases that are followed each by itself: `follow(numbers, ts)` gives (times, names)."""
+
+    def truth(n, ts):
+        cases = (
+            SimpleNamespace(**{name: float(x[i, 0]) for name, x in vars(n).items()}) for i in range(len(ts))
+        )
+        return Truth(np.stack([follow(*case) for case in zip(cases, ts, strict=True)]))
+
+    return truth
+
+
+def piece(rates, t, y, end, events=()):
+    """A piece of a motion by SciPy, until the value of one of the events passes zero."""
+    for event in events:
+        event.terminal = True
+    return solve_ivp(
+        rates,
+        (t, end),
+        y,
+        "DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+        max_step=0.02,
+        events=events or None,
+        dense_output=True,
+    )
+
+
+def together(numbers):
     """Numbers of many cases as arrays."""
     return {name: np.array([one[name] for one in numbers]) for name in numbers[0]}

@@ -21,7 +21,7 @@ MOST = 0.05  # of the size of a quantity: wrong in any case
 SUCCESS, EVENT = 0, 1
 
 
-def search(family: Family, seeds: list[int]) -> list[Record]:
+def search(family: Family, seeds) -> list[Record]:
     """Records of the cases with these seeds; those that ask alike run together."""
     single = not jax.config.jax_enable_x64
     dtype, found = "float32" if single else "float64", []
@@ -37,14 +37,13 @@ def search(family: Family, seeds: list[int]) -> list[Record]:
         seconds = (time.process_time() - begin) / len(own)
         for i, seed in enumerate(own):
             outcome, error, said = _judged(family, ask, motions[i], i, numbers, truth, growth)
-            told = f"{ask}; ts to {float(ts[i, -1])!r}; " + ", ".join(
-                f"{name}={value!r}" for name, value in numbers[i].items()
-            )
+            values = ", ".join(f"{name}={value!r}" for name, value in numbers[i].items())
+            told = f"{ask}; ts to {float(ts[i, -1])!r}; {values}"
             found.append(Record(family.name, seed, dtype, told, outcome, error, said, seconds))
     return sorted(found, key=lambda record: record.seed)
 
 
-def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
+def _truth(family: Family, numbers, ts):
     """The truth, and how much its values (cases, times + 1, names + 1: the end, and the time, too) grow from
     a relative change of 1.
     """
@@ -56,28 +55,27 @@ def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
             off = NUDGE * np.where(draw.uniform(size=count) < 0.5, -1.0, 1.0)
             absolute = off if family.size is None else 0.0
             every[name].append(value if name in family.fixed else value * (1 + off) + absolute)
-    truth = family.right(
-        {name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1))
-    )
-    whole = _whole(truth, np.tile(ts, (1 + NUDGES, 1))).reshape(1 + NUDGES, count, ts.shape[1] + 1, -1)
+    stops = np.tile(ts, (1 + NUDGES, 1))
+    truth = family.right({name: np.concatenate(values) for name, values in every.items()}, stops)
+    whole = _whole(truth, stops).reshape(1 + NUDGES, count, ts.shape[1] + 1, -1)
     growth = np.nan_to_num(np.max(np.abs(whole[1:] - whole[0]), axis=0) / NUDGE)
     return truth, growth
 
 
-def _whole(truth: Truth, ts) -> np.ndarray:
+def _whole(truth: Truth, ts):
     values = np.concatenate([truth.values, truth.last[:, None]], axis=1)
     t_end = ts[:, -1] if truth.t_end is None else truth.t_end
     times = np.concatenate([np.zeros_like(ts), t_end[:, None]], axis=1)
     return np.concatenate([values, times[..., None]], axis=2)
 
 
-def places_of(family: Family) -> list[tuple[str, int]]:
+def places_of(family: Family):
     """Where each compared name stands: among the coordinates `q` or the speeds `u`."""
     q, u = (names.entries for names in (family.scene().coordinate_names, family.scene().speed_names))
     return [("q", q.index(name)) if name in q else ("u", u.index(name)) for name in family.names.split()]
 
 
-def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, growth):
+def _judged(family: Family, ask: Ask, motion, i, numbers, truth: Truth, growth):
     """Outcome, error relative to its bound, and words."""
     if isinstance(motion, Failed):
         return motion.outcome, None, motion.said
@@ -90,61 +88,46 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
     rtol = tolerance(ask)
     count = min(int(motion.accepted), 1000) + 10
     expected, size = truth.values[i], _size(family, numbers, truth, i)
-    wide = lambda grown: np.minimum(family.slack * 2 * count * rtol * (size + grown), MOST * size)
-    allowed = wide(np.nan_to_num(np.max(growth[i, :, :-1], axis=0)))
+    wide = lambda grown, size: np.minimum(family.slack * 2 * count * rtol * (size + grown), MOST * size)
+    allowed = wide(np.nan_to_num(np.max(growth[i, :, :-1], axis=0)), size)
     reached = np.isfinite(expected)
     if truth.event is None and not np.all(reached):
         return UNDECIDED, None, "the reference did not settle"
     if not np.array_equal(np.isfinite(values), reached) and truth.event is None:
-        return _wrong(
-            motion, np.inf, "values are not finite where the motion exists, or finite after its end"
-        )
-    both = reached & np.isfinite(values)
-    off = np.where(both, np.abs(values - np.where(reached, expected, 0.0)) / allowed, 0.0)
-    error = max(
-        float(np.max(off, initial=0.0)),
-        float(np.max(np.abs(end - truth.last[i]) / allowed)) if np.all(np.isfinite(end)) else np.inf,
-    )
-    worst = (
-        f"`{family.names.split()[int(np.argmax(np.max(off, axis=0)))]}` is off by"
-        f" {float(np.max(off * allowed, initial=0.0)):.2e}"
-    )
-    worst += (
-        f", the end {np.array2string(end, precision=6)} for {np.array2string(truth.last[i], precision=6)}"
-    )
+        said = "values are not finite where the motion exists, or finite after its end"
+        return _wrong(motion, np.inf, said)
+    off = np.abs(values - expected) / allowed
+    off = np.where(np.isfinite(off), off, 0.0)
+    last, t_end = truth.last[i], float(motion.t_end)
+    at_end = np.max(np.abs(end - last) / allowed) if np.all(np.isfinite(end)) else np.inf
+    error = float(max(np.max(off, initial=0.0), at_end))
+    name = family.names.split()[int(np.argmax(np.max(off, axis=0)))]
+    worst = f"`{name}` is off by {float(np.max(off * allowed, initial=0.0)):.2e}, the end {end} for {last}"
     if truth.event is not None:
-        named = motion.event_names[int(motion.event)] if code == EVENT else ""
+        named, right = motion.event_names[int(motion.event)] if code == EVENT else "", float(truth.t_end[i])
         if named != truth.event[i]:
-            return _wrong(
-                motion,
-                np.inf,
-                f"ends by `{named}` at {float(motion.t_end):.6g} s instead of `{truth.event[i]}` at"
-                f" {truth.t_end[i]:.6g} s",
-            )
-        scale = abs(truth.t_end[i] - numbers[i].get("t0", 0.0)) + 1e-3
-        late = abs(float(motion.t_end) - truth.t_end[i]) / min(
-            family.slack * 2 * count * rtol * (scale + growth[i, -1, -1]), MOST * scale
-        )
+            said = f"ends by `{named}` at {t_end:.6g} s instead of `{truth.event[i]}` at {right:.6g} s"
+            return _wrong(motion, np.inf, said)
+        scale = abs(right - numbers[i].get("t0", 0.0)) + 1e-3
+        late = abs(t_end - right) / wide(growth[i, -1, -1], scale)
         if late > error:
-            error, worst = late, f"ends at {float(motion.t_end)!r} s instead of {float(truth.t_end[i])!r} s"
+            error, worst = late, f"ends at {t_end!r} s instead of {right!r} s"
     elif code == EVENT:
-        return _wrong(motion, np.inf, f"ends by an event at {float(motion.t_end):.6g} s")
+        return _wrong(motion, np.inf, f"ends by an event at {t_end:.6g} s")
     if not error > 1.0:
         return RIGHT, error, ""
     return _wrong(motion, error, worst)
 
 
-def _size(family: Family, numbers, truth: Truth, i: int) -> np.ndarray:
+def _size(family: Family, numbers, truth: Truth, i):
     """What counts as the size of each name: the largest value, or what the family says; at least `size`
     or 1.
     """
     least = 1.0 if family.size is None else np.array(family.size(SimpleNamespace(**numbers[i])))
-    return np.maximum(
-        np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0, where=np.isfinite(truth.values[i])), least
-    )
+    return np.maximum(np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0), least)
 
 
-def _wrong(motion, error: float, said: str):
+def _wrong(motion, error, said):
     """Wrong, unless the motion warns."""
     try:
         warned = "; ".join(jax.tree.map(jnp.asarray, motion).warnings)

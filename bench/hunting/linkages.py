@@ -5,8 +5,6 @@ it arrives is tangent to that branch alone. On a branch with coordinates q(s), w
 I'(s) s'^2/2 + V'(s) = 0.
 """
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,22 +15,18 @@ from hunting.reference import along, integrate
 
 def rod(mass, length, position, angle):
     """A uniform rod in the plane of x and y."""
-    return jj.RigidBody(
-        mass,
-        mass * length**2 / 12 * jnp.array([1e-3, 1.0, 1.0]),
-        jnp.stack([position[0], position[1], 0.0 * angle]),
-        jj.rot_z(angle),
-    )
+    moments = mass * length**2 / 12 * jnp.array([1e-3, 1.0, 1.0])
+    return jj.RigidBody(mass, moments, [*position[:2], 0.0], jj.rot_z(angle))
 
 
 def ahead(length, angle):
     """A vector of this length."""
-    return length * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0 * angle])
+    return length * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0])
 
 
 def on_axis(x):
     """A point on the x axis."""
-    return jnp.stack([jnp.asarray(x), 0.0 * x, 0.0 * x])
+    return jnp.stack([x, 0.0, 0.0])
 
 
 class InPlane(jj.Scene):
@@ -44,7 +38,7 @@ class InPlane(jj.Scene):
     g: object = jj.parameter(9.81)
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.g, (0.0, -1.0, 0.0)),)
+        return jj.gravity(motion, self.g, (0.0, -1.0, 0.0))
 
 
 class FourBarInAngles(InPlane):
@@ -67,15 +61,8 @@ class FourBarInAngles(InPlane):
         }
 
     def geometric_constraints(self, pose):
-        return {
-            "loop": jj.pin(
-                *(
-                    pose[name].place(on_axis(0.5 * r))
-                    for name, r in (("coupler", self.r2), ("rocker", self.r3))
-                ),
-                axes="xy",
-            )
-        }
+        coupler = pose["coupler"].place(on_axis(0.5 * self.r2))
+        return {"loop": jj.pin(coupler, pose["rocker"].place(on_axis(0.5 * self.r3)), axes="xy")}
 
 
 class FourBarWithPins(FourBarInAngles):
@@ -144,9 +131,7 @@ def potential(n, q):
     return n.g * (n.m1 * n.r1 / 2 * a + n.m2 * (n.r1 * a + n.r2 / 2 * b) + n.m3 * n.r3 / 2 * c)
 
 
-def on_branch(
-    branch: Callable, twice_kinetic: Callable = twice_kinetic, potential: Callable = potential
-) -> Callable:
+def on_branch(branch, twice_kinetic=twice_kinetic, potential=potential):
     """The truth of motions on a branch."""
 
     def truth(n, ts):
@@ -164,15 +149,13 @@ def on_branch(
     return truth
 
 
-def starting(branch: Callable, names: str = "abc", pins: bool = False) -> Callable:
+def starting(branch, names="abc", pins=False):
     """Start values of a branch."""
 
     def start(n):
         q, dq = branch(n, jnp.asarray(n.s), jnp)
         rates = [slope * n.s_rate for slope in dq]
-        found = dict(zip(names, q, strict=True)) | {
-            f"{name}_rate": rate for name, rate in zip(names, rates, strict=True)
-        }
+        found = dict(zip((*names, *(f"{name}_rate" for name in names)), (*q, *rates), strict=True))
         if not pins:
             return found
         c, s = n.r1 * jnp.cos(q[0]), n.r1 * jnp.sin(q[0])
@@ -183,12 +166,8 @@ def starting(branch: Callable, names: str = "abc", pins: bool = False) -> Callab
         )
         for k, ((x, y, vx, vy, r), angle, rate) in enumerate(zip(joints, q, rates, strict=True), start=1):
             c, s = r / 2 * jnp.cos(angle), r / 2 * jnp.sin(angle)
-            found |= {
-                f"x{k}": x + c,
-                f"y{k}": y + s,
-                f"x{k}_rate": vx - s * rate,
-                f"y{k}_rate": vy + c * rate,
-            }
+            found |= {f"x{k}": x + c, f"y{k}": y + s}
+            found |= {f"x{k}_rate": vx - s * rate, f"y{k}_rate": vy + c * rate}
         return found
 
     return start
@@ -197,19 +176,16 @@ def starting(branch: Callable, names: str = "abc", pins: bool = False) -> Callab
 MASSES = {f"m{k}": (0.3, 3.0) for k in (1, 2, 3)} | {"g": one_of(0.0, 9.81)}
 
 
-def lengths_drawn(kind: str) -> Callable:
+def lengths_drawn(kite):
     """Lengths, masses and a start of a parallelogram or a kite."""
 
     def draw(r):
-        short, long = (
-            (r.uniform(0.5, 1.5), r.uniform(1.3, 2.5))
-            if r.uniform() < 0.5
-            else (float(r.choice([0.5, 1.0])), float(r.choice([1.5, 2.0, 3.0])))
-        )
-        lengths = {
-            "parallel": (short, short * long, short, short * long),
-            "kite": (short, short * long, short * long, short),
-        }[kind]
+        if r.uniform() < 0.5:
+            short, long = r.uniform(0.5, 1.5), r.uniform(1.3, 2.5)
+        else:
+            short, long = float(r.choice([0.5, 1.0])), float(r.choice([1.5, 2.0, 3.0]))
+        long *= short
+        lengths = (short, long, long, short) if kite else (short, long, short, long)
         turn = float(r.choice([-1.0, 1.0]))
         found = dict(zip(("r1", "r2", "r3", "d"), lengths, strict=True)) | drawn(
             **MASSES, s=(0.3, np.pi - 0.3), s_rate=(2.0, 12.0)
@@ -225,43 +201,20 @@ PINS = {"scene": FourBarWithPins, "asks": FEW, "single": False}  # nine coordina
 ANGLES = {"scene": FourBarInAngles, "asks": SOME}
 
 
-def _linkage(name, what, branch, kind, pins=False, **more):
-    fixed = ("span", "r1", "r2", "r3", "d")
-    common = FOUR_BAR | (PINS if pins else ANGLES) | more
-    return Family(
-        name=name,
-        what=what,
-        draw=lengths_drawn(kind),
-        start=starting(branch, pins=pins),
-        truth=on_branch(branch),
-        fixed=fixed,
-        **common,
-    )
+def _linkage(name, what, branch, cases=70):
+    pins = name.endswith("pins")
+    how = {"draw": lengths_drawn("kite" in name), "start": starting(branch, pins=pins), "cases": cases}
+    how |= {"truth": on_branch(branch), "fixed": ("span", "r1", "r2", "r3", "d")}
+    return Family(name=name, what=what, **FOUR_BAR | (PINS if pins else ANGLES) | how)
 
 
+FLAT = "parallelogram linkage laid flat"
 FAMILIES = (
-    _linkage(
-        "parallelogram", "parallelogram linkage laid flat, in angles", parallelogram, "parallel", cases=140
-    ),
-    _linkage(
-        "parallelogram-pins",
-        "parallelogram linkage laid flat, nine coordinates with pins",
-        parallelogram,
-        "parallel",
-        pins=True,
-        cases=105,
-    ),
-    _linkage(
-        "antiparallelogram", "antiparallelogram linkage laid flat, in angles", antiparallelogram, "parallel"
-    ),
-    _linkage(
-        "antiparallelogram-pins",
-        "antiparallelogram linkage laid flat, with pins",
-        antiparallelogram,
-        "parallel",
-        pins=True,
-    ),
-    _linkage("kite", "kite linkage through its fold, in angles", kite, "kite"),
-    _linkage("folded-kite", "kite linkage folded onto its ground", folded_kite, "kite"),
-    _linkage("folded-kite-pins", "the same with pins", folded_kite, "kite", pins=True, cases=35),
+    _linkage("parallelogram", f"{FLAT}, in angles", parallelogram, 140),
+    _linkage("parallelogram-pins", f"{FLAT}, nine coordinates with pins", parallelogram, 105),
+    _linkage("antiparallelogram", f"anti{FLAT}, in angles", antiparallelogram),
+    _linkage("antiparallelogram-pins", f"anti{FLAT}, with pins", antiparallelogram),
+    _linkage("kite", "kite linkage through its fold, in angles", kite),
+    _linkage("folded-kite", "kite linkage folded onto its ground", folded_kite),
+    _linkage("folded-kite-pins", "the same with pins", folded_kite, 35),
 )

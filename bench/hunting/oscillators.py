@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from small_scenes import OnLine
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, drawn, one_of
+from hunting.family import Ask, Family, drawn, one_by_one, one_of, power
 
 
 class Oscillator(OnLine):
@@ -25,11 +25,16 @@ class Oscillator(OnLine):
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push - self.k * q.x - self.c * u.x_rate),)
+        return jj.generalized_force(motion, x_rate=motion.inputs.push - self.k * q.x - self.c * u.x_rate)
 
 
-def _one(n, ts, knots, values) -> np.ndarray:
-    """States (2, times) of one oscillator; the push is constant beyond its knots."""
+def pushed_by(push):
+    """The truth of oscillators; `push(numbers of one case)` gives knots and values."""
+    return one_by_one(lambda n, ts: _one(n, ts, *map(np.asarray, push(n))))
+
+
+def _one(n, ts, knots, values):
+    """States (times, 2) of one oscillator; the push is constant beyond its knots."""
     n = SimpleNamespace(**{"mass": 1.0, "c": 0.0, "t0": 0.0} | vars(n))
     A = np.array(
         [[0, 1, 0, 0], [-n.k / n.mass, -n.c / n.mass, 1 / n.mass, 0], [0, 0, 0, 1], [0, 0, 0, 0]], float
@@ -40,25 +45,10 @@ def _one(n, ts, knots, values) -> np.ndarray:
         y = (expm(A * (stop - t)) @ np.array([*y, f[0], (f[1] - f[0]) / (stop - t)]))[:2]
         t = stop
         found += [y] if stop in ts else []
-    return np.array(found).T
+    return np.array(found)
 
 
-def pushed_by(push):
-    """The truth of oscillators; `push(numbers of one case)` gives knots and values."""
-
-    def truth(n, ts):
-        cases = [
-            SimpleNamespace(**{name: float(x[i, 0]) for name, x in vars(n).items()}) for i in range(len(ts))
-        ]
-        return np.stack(
-            [_one(one, times, *map(np.asarray, push(one))) for one, times in zip(cases, ts, strict=True)],
-            axis=1,
-        )
-
-    return truth
-
-
-def _blow(n, space=np):
+def blow(n, space=np):
     """A hammer blow of the given length, up and down in a tenth of it."""
     t, d = n.when, n.length
     return space.stack([t - 0.1 * d, t, t + d, t + 1.1 * d]), n.force * space.asarray([0.0, 1.0, 1.0, 0.0])
@@ -70,60 +60,27 @@ def _record(n, space=np):
     return n.span * 1.001 * space.asarray(k / 39.0), n.force * space.sin(n.when * (k + 1.0) ** 2)
 
 
-def _pushed(push, shared: tuple[str, ...]) -> dict:
+def _pushed(push, shared):
     inputs = lambda n: {"push": jj.Sampled(*push(n, jnp))}
-    return OSCILLATOR | {
-        "truth": pushed_by(push),
-        "inputs": inputs,
-        "shared": ("span", *shared),
-        "fixed": ("span", "when"),
-        "cases": 72,
-    }
+    how = {"shared": ("span", *shared), "fixed": ("span", "when"), "cases": 72}
+    return OSCILLATOR | how | {"truth": pushed_by(push), "inputs": inputs}
 
 
-def _blow_drawn(r):
-    span, length = float(r.choice([2.0, 10.0])), 10 ** r.uniform(-3.5, -1.0)
-    rest = {
-        "k": r.uniform(0.2, 4.0),
-        "x": r.uniform(0, 0.3),
-        "x_rate": 0.0,
-        "when": r.uniform(0.1, 0.8) * span,
-        "length": length,
-    }
-    return rest | {"force": r.uniform(0.5, 3.0) / length, "span": span}
-
-
-def _far_drawn(r):
-    k = 10 ** r.uniform(0.0, 6.0)
-    start = {
-        "x": r.uniform(-1, 1),
-        "x_rate": r.uniform(-1, 1) * np.sqrt(k),
-        "t0": float(r.choice([1.7e9, 1e6, -3e4, 1e12])),
-    }
-    return {"k": k} | start | {"span": 10 ** r.uniform(1.0, 2.5) / np.sqrt(k)}
-
-
-def _stiff_drawn(r):
-    k, c = 10 ** r.uniform(3.0, 9.0), 10 ** r.uniform(0.0, 3.0)
-    return {
-        "k": k,
-        "c": c * np.sqrt(k),
-        "x": r.uniform(0.5, 1.0),
-        "x_rate": 0.0,
-        "span": r.uniform(1.0, 10.0),
-    }
+BLOWS = drawn(
+    span=one_of(2.0, 10.0), length=power(-3.5, -1.0), k=(0.2, 4.0), x=(0, 0.3), x_rate=0.0,
+    when=lambda r, n: r.uniform(0.1, 0.8) * n.span, force=lambda r, n: r.uniform(0.5, 3.0) / n.length,
+)  # fmt: skip
+FAR = drawn(
+    k=power(0.0, 6.0), x=(-1, 1), x_rate=lambda r, n: r.uniform(-1, 1) * np.sqrt(n.k),
+    t0=one_of(1.7e9, 1e6, -3e4, 1e12), span=lambda r, n: 10 ** r.uniform(1.0, 2.5) / np.sqrt(n.k),
+)  # fmt: skip
 
 
 def _units_drawn(r):
     m, w, size = 10 ** r.uniform(-20, 20), 10 ** r.uniform(-6, 6), 10 ** r.uniform(-12, 12)
-    return {
-        "mass": m,
-        "k": m * w * w,
-        "x": size,
-        "x_rate": 0.3 * size * w,
-        "span": r.uniform(1, 10) / w,
-        "atol": 1e-8 * size * min(w, 1.0),
-    }
+    start = {"x": size, "x_rate": 0.3 * size * w}
+    tolerance = {"span": r.uniform(1, 10) / w, "atol": 1e-8 * size * min(w, 1.0)}
+    return {"mass": m, "k": m * w * w} | start | tolerance
 
 
 WAYS = (
@@ -138,9 +95,9 @@ OSCILLATOR = {"scene": Oscillator, "names": "x x_rate", "asks": WAYS}
 FREE = OSCILLATOR | {"truth": pushed_by(lambda n: ([0.0, 1.0], [0.0, 0.0]))}
 FAMILIES = (
     Family(
-        name="hammer", what="an oscillator that `Sampled` strikes for 0.3 to 100 ms", draw=_blow_drawn,
+        name="hammer", what="an oscillator that `Sampled` strikes for 0.3 to 100 ms", draw=BLOWS,
         single=False,
-        **_pushed(_blow, ("when", "length", "force")),
+        **_pushed(blow, ("when", "length", "force")),
     ),
     Family(
         name="record", what="an oscillator pushed by forty samples of noise", slack=10.0,
@@ -148,7 +105,7 @@ FAMILIES = (
         draw=drawn(k=(0.2, 4.0), c=(0, 1), x=(0, 1), x_rate=0.0, when=(0, 3), force=(1, 20), span=5.0),
     ),
     Family(
-        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=_far_drawn, cases=72,
+        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=FAR, cases=72,
         single=False, fixed=("span", "t0", "k"),
         size=lambda n: (np.hypot(n.x, n.x_rate / np.sqrt(n.k)), np.hypot(n.x * np.sqrt(n.k), n.x_rate)),
         **FREE,
@@ -159,7 +116,11 @@ FAMILIES = (
         draw=drawn(k=(1, 100), x=(0, 1), x_rate=(0, 1), t0=one_of(1e3, 1e4, 1e5), span=(1, 10)), **FREE,
     ),
     Family(
-        name="stiff", what="overdamped oscillators, rates apart by up to 1e12", draw=_stiff_drawn,
+        name="stiff", what="overdamped oscillators, rates apart by up to 1e12",
+        draw=drawn(
+            k=power(3.0, 9.0), c=lambda r, n: 10 ** r.uniform(0.0, 3.0) * np.sqrt(n.k), x=(0.5, 1.0),
+            x_rate=0.0, span=(1.0, 10.0),
+        ),
         fixed=("span", "k", "c"), cases=48, single=False, **FREE,
     ),
     Family(

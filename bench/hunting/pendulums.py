@@ -5,7 +5,7 @@ speeds then stop determining the others.
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import ellipk
-from small_scenes import Upright
+from small_scenes import InSpace, OnPlane, Upright
 
 import jourdain_jax as jj
 from hunting.family import Ask, Family, G, drawn, either, one_of
@@ -16,7 +16,7 @@ class Weighted(jj.Scene):
     """Under gravity."""
 
     def loads(self, motion):
-        return (jj.gravity(motion, G),)
+        return jj.gravity(motion, G)
 
 
 class RodPendulum(Weighted, Upright):
@@ -48,14 +48,7 @@ LENGTH = one_of(1.0, (0.7, 1.4))
 SWING = drawn(length=LENGTH, mass=(0.2, 4.0), v=either(5.0, 10.0), span=one_of(2.0, (0.5, 4.0)))
 
 
-def _turning_drawn(r):
-    return SWING(r) | {
-        "v": r.uniform(6.8, 11.0),
-        "length": r.uniform(0.7, 1.0),
-        "whole": float(r.uniform() < 0.5),
-    }
-
-
+TURNING = drawn(v=(6.8, 11.0), length=(0.7, 1.0), whole=lambda r, n: r.uniform() < 0.5)
 ROD = {
     "scene": RodPendulum,
     "start": lambda n: {"z": -n.length, "x_rate": n.v, "z_rate": 0.0},
@@ -67,11 +60,8 @@ ROD = {
 class SphericalPendulum(RodPendulum):
     """A rod pendulum in space."""
 
-    coordinates = jj.coordinates("x y z")
+    coordinates, bodies = InSpace.coordinates, InSpace.bodies
     domain = {"x": (-0.4, 0.4), "y": (-0.4, 0.4), "z": (-1.0, -0.8)}
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(self.mass, q.array)}
 
 
 def _spherical_truth(n, ts):
@@ -84,25 +74,22 @@ def _spherical_truth(n, ts):
     return integrate(rates, (0.0, 0.0, -n.length, n.x_rate, n.y_rate, 0.0), ts, width=0.03)
 
 
-class BeadOnRing(jj.Scene):
+class BeadOnRing(OnPlane):
     """A bead in a plane on a ring, and the arc that it has gone: `arc: x ydot - y xdot - sdot`."""
 
     domain = {"x": (0.7, 1.0), "y": (-0.5, 0.5), "s": (-0.5, 0.5)}
     coordinates = jj.coordinates("x y s")
     weight: object = jj.parameter(0.0)
 
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
-
     def geometric_constraints(self, pose):
-        return {"ring": jj.rod(jnp.zeros(3), pose["bead"].position, 1.0)}
+        return {"ring": jj.rod(jnp.zeros(3), pose["mass"].position, 1.0)}
 
     def velocity_constraints(self, motion):
         q, u = motion.q, motion.u
         return {"arc": q.x * u.y_rate - q.y * u.x_rate - u.s_rate}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.weight, (0.0, -1.0, 0.0)),)
+        return jj.gravity(motion, self.weight, (0.0, -1.0, 0.0))
 
 
 class BeadOnWideRing(BeadOnRing):
@@ -135,18 +122,14 @@ class Blade(jj.Scene):
     domain = {"heading": (-0.3, 0.3)}
 
     def bodies(self, t, q):
-        return {
-            "body": jj.RigidBody(
-                1.0, 0.3 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading)
-            )
-        }
+        return {"body": jj.RigidBody(1.0, 0.3 * jnp.ones(3), [q.x, q.y, 0.0], jj.rot_z(q.heading))}
 
     def velocity_constraints(self, motion):
         body = motion["body"]
         return {"blade": jj.knife_edge(body, body.position, body.orientation[:, 1])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.push, (1.0, 0.0, 0.0)),)
+        return jj.gravity(motion, self.push, (1.0, 0.0, 0.0))
 
 
 def _blade_truth(n, ts):
@@ -164,11 +147,8 @@ class RodChain(Weighted):
     second: object = jj.parameter(1.0, positive=True)
 
     def bodies(self, t, q):
-        place = lambda x, z: jnp.stack([x, 0.0 * x, z])
-        return {
-            "upper": jj.Particle(1.0, place(q.x1, q.z1)),
-            "lower": jj.Particle(self.second, place(q.x2, q.z2)),
-        }
+        upper, lower = [q.x1, 0.0, q.z1], [q.x2, 0.0, q.z2]
+        return {"upper": jj.Particle(1.0, upper), "lower": jj.Particle(self.second, lower)}
 
     def geometric_constraints(self, pose):
         upper, lower = pose["upper"].position, pose["lower"].position
@@ -198,7 +178,8 @@ FAMILIES = (
         cases=140,
     ),
     Family(
-        name="rod-pendulum-in-step", what="the same, saved in step with its rotation", draw=_turning_drawn,
+        name="rod-pendulum-in-step", what="the same, saved in step with its rotation",
+        draw=lambda r: SWING(r) | TURNING(r),
         times=_full_turns, fixed=("span", "whole"),
         asks=(Ask("simulate", 2), Ask("jit", 8), Ask("vmap", 1, 1e-6), Ask("simulate", 4, 1e-6)), **ROD,
     ),

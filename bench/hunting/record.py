@@ -10,14 +10,8 @@ from traceback import walk_tb
 
 import numpy as np
 
-RIGHT, BY_CODE, BY_WARNING, REFUSED, WRONG, CRASHED = (
-    "right",
-    "flagged by code",
-    "flagged by warning",
-    "refused",
-    "wrong",
-    "crashed",
-)
+RIGHT, BY_CODE, BY_WARNING = "right", "flagged by code", "flagged by warning"
+REFUSED, WRONG, CRASHED = "refused", "wrong", "crashed"
 UNDECIDED = "no reference"  # it did not settle: neither right nor wrong
 OUTCOMES = (RIGHT, BY_CODE, BY_WARNING, REFUSED, WRONG, CRASHED, UNDECIDED)
 LOST = (WRONG, CRASHED)  # what a search is for
@@ -36,20 +30,20 @@ class Record:
     said: str = ""  # by the engine, where it flagged, refused or crashed; where it is wrong, by the judge
     seconds: float = 0.0
 
-    def as_dict(self) -> dict:
+    def as_dict(self):
         """As JSON holds it."""
         error = None if self.error is None or not np.isfinite(self.error) else float(self.error)
         return asdict(self) | {"error": error}
 
 
-def outcome_of(code: int, error: float, said: str) -> str:
+def outcome_of(code, error, said):
     """What became of a motion: by its result code, its error over what is allowed, and what is said against
     it.
     """
     return BY_CODE if code not in (0, 1) else RIGHT if error <= 1 else BY_WARNING if said else WRONG
 
 
-def refusal(error: Exception) -> tuple[str, str]:
+def refusal(error: Exception):
     """Outcome and words of an error: the engine's own kinds are refusals, others crashes."""
     import jourdain_jax as jj
 
@@ -58,7 +52,7 @@ def refusal(error: Exception) -> tuple[str, str]:
     return (REFUSED if own else CRASHED), f"{type(error).__name__}: {text[0][:160] if text else ''}"
 
 
-def _raw(error: Exception) -> bool:
+def _raw(error: Exception):
     """Whether a ValueError was raised below the engine (JAX, NumPy, diffrax raise such too)."""
     *_, (raised, _) = walk_tb(error.__traceback__)
     return not raised.f_globals["__name__"].startswith("jourdain_jax")

@@ -5,8 +5,6 @@ Nothing here knows the engine. Hairer, Norsett, Wanner, Solving Ordinary Differe
 and II.10 (coefficients from SciPy).
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.integrate._ivp import dop853_coefficients as table
 
@@ -16,7 +14,7 @@ SHORTEST = 1e-7  # of a span: a motion that needs shorter steps is given up
 MOST = 20_000  # steps
 
 
-def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: float = 0.05) -> np.ndarray:
+def integrate(rates, start, ts, *, t0=0.0, width=0.05):
     """States (n, cases, times) of y' = rates(t, *y) from n numbers at times ts (cases, times); first step
     `width` s.
 
@@ -53,11 +51,11 @@ def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: f
     return np.concatenate(found, axis=-1)
 
 
-def _step(rates: Callable, t, y, h):
+def _step(rates, t, y, h):
     """The next state, and its error (cases, 1) relative to what is let pass; zero where a case was given
     up.
     """
-    stages: list[np.ndarray] = []
+    stages = []
     at = lambda t, y: np.stack([np.broadcast_to(x, t.shape) for x in rates(t, *y)])
     for i in range(table.N_STAGES):
         slope = sum((A[i, j] * stages[j] for j in range(i) if A[i, j]), np.zeros_like(y))
@@ -73,7 +71,7 @@ def _step(rates: Callable, t, y, h):
     return new, np.where(given_up, 0.0, np.nan_to_num(off, nan=1e30, posinf=1e30))
 
 
-def along(value: Callable, x, direction) -> np.ndarray:
+def along(value, x, direction):
     """Derivative of an analytic `value` at x (a tuple of arrays) along `direction`, by a complex step: exact
     to round-off.
     """

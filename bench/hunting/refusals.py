@@ -8,6 +8,7 @@ wrong.
 import json
 import re
 import tempfile
+import tomllib
 import warnings
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from figures import fresh
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from hunting.family import G
+from hunting.family import G, drawn, one_of, power
 from hunting.pendulums import SphericalPendulum
 from hunting.uses import Single, in_way, warnings_of
 from jourdain_jax.studies import End, Uniform
@@ -26,17 +27,14 @@ from jourdain_jax.studies import End, Uniform
 WAYS = ("simulate", "jit", "rollout", "jit rollout")
 
 
-def _asked(scene, parameters: dict[str, float], start: dict, way: str, **options):
+def _asked(scene, parameters, start, way, **options):
     """The motion of a scene whose `parameters` are numbers, in one of the ways; of two lanes the second is
     the one that is meant.
     """
     one = lambda p: jj.simulate(scene.replace(**p), start, **options)
 
     def lanes(p):
-        both = {
-            name: jnp.stack([jnp.asarray(getattr(scene, name)), jnp.asarray(value)])
-            for name, value in p.items()
-        }
+        both = {name: jnp.stack([getattr(scene, name), value]) for name, value in p.items()}
         return jj.rollout(scene, start, parameters=both, **options).lanes
 
     return in_way(way, one, lanes, parameters)
@@ -64,18 +62,15 @@ class Block(jj.Scene):
     down: object = jj.parameter(1.0)  # length of gravity's direction
 
     def bodies(self, t, q):
-        o = 0.0 * q.x
         inertia = jnp.array([[1.0, 0.1, 0.0], [0.1, 1.2, 0.0], [0.0, 0.0, 1.1]])
         inertia = inertia.at[0, 1].add(_beyond(self.above)).at[0, 0].add(-_beyond(self.smallest))
         inertia = inertia.at[2, 2].add(_beyond(self.largest))
         side = jnp.where(self.mirror > 1e4, -1.0, 1.0)
-        turned = (
-            (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) @ jnp.diag(jnp.stack([1.0 + o, 1.0 + o, side + o]))
-        )
-        return {"block": jj.RigidBody(1.0, inertia, jnp.stack([q.x, o, o]), turned)}
+        turned = (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) * jnp.stack([1.0, 1.0, side])
+        return {"block": jj.RigidBody(1.0, inertia, [q.x, 0.0, 0.0], turned)}
 
     def loads(self, motion):
-        return (jj.gravity(motion, G, (1.0 + _beyond(self.down)) * jnp.array([1.0, 0.0, 0.0])),)
+        return jj.gravity(motion, G, (1.0 + _beyond(self.down)) * jnp.array([1.0, 0.0, 0.0]))
 
 
 class Wheel(jj.Scene):
@@ -97,12 +92,8 @@ class Wheel(jj.Scene):
         return jj.Plane(normal=(1.0 + _beyond(self.normal)) * jnp.array([0.0, 0.0, 1.0]))
 
     def bodies(self, t, q):
-        at = jnp.stack([q.x, q.y, 0.0 * q.x + self.sizes()[1]])
-        return {
-            "wheel": jj.RigidBody(
-                1.0, jnp.array([0.03, 0.05, 0.03]), at, jj.rot_z(q.heading) @ jj.rot_y(q.spin)
-            )
-        }
+        at, turned = [q.x, q.y, self.sizes()[1]], jj.rot_z(q.heading) @ jj.rot_y(q.spin)
+        return {"wheel": jj.RigidBody(1.0, jnp.array([0.03, 0.05, 0.03]), at, turned)}
 
     def contacts(self, pose):
         return {"floor": jj.disc_contact(pose["wheel"], self.sizes()[0], ground=self.ground())}
@@ -143,7 +134,7 @@ IMPOSSIBLE = (
 )
 
 
-def _impossible(seed: int):
+def _impossible(seed):
     r = np.random.default_rng([seed, 90])
     what, scene, name, least_and_most = IMPOSSIBLE[seed % len(IMPOSSIBLE)]
     way, change = WAYS[seed // len(IMPOSSIBLE) % len(WAYS)], {name: 1e4 + r.uniform(*least_and_most)}
@@ -169,32 +160,21 @@ class Lawful(OnPlane):
         return {"speed": self.power * (u.x_rate**2 + u.y_rate**2 - (1.0 - motion.t / self.stop) ** 2)}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.pull, (0.0, -1.0, 0.0)),)
+        return jj.gravity(motion, self.pull, (0.0, -1.0, 0.0))
 
 
-def _at_rest(seed: int):
+def _at_rest(seed):
     r = np.random.default_rng([seed, 94])
     count, angle, way = int(r.integers(1, 60)), r.uniform(0, 2 * np.pi), WAYS[seed % len(WAYS)]
     ts = np.linspace(0, 2, count + 1)[1:]
-    stop = float(r.choice([r.choice(ts), r.uniform(0.2, 1.9), r.uniform(2.1, 4.0)]))
-    parameters = {
-        "stop": stop,
-        "pull": float(r.choice([0.0, r.uniform(0.1, 3)])),
-        "power": float(10 ** r.uniform(-3, 3)),
-    }
-    options = {
-        "ts": ts,
-        "rtol": float(10 ** r.uniform(-10, -4)),
-        "backend": str(r.choice(["auto", "auto", "xla", "dense"])),
-    }
-    motion = _asked(Lawful(), parameters, {"x_rate": np.cos(angle), "y_rate": np.sin(angle)}, way, **options)
-    off = abs(np.hypot(*np.asarray(motion.u_end)) - (1 - 2 / stop))
-    return (
-        f"{way}: {parameters}, {count} times, {options['backend']}",
-        off / 1e-3 if stop > 2 else np.inf,
-        int(motion.result),
-        warnings_of(motion),
-    )
+    stops = one_of(r.choice(ts), (0.2, 1.9), (2.1, 4.0))
+    parameters = drawn(stop=stops, pull=one_of(0.0, (0.1, 3)), power=power(-3, 3))(r)
+    start = {"x_rate": np.cos(angle), "y_rate": np.sin(angle)}
+    rtol, backend = float(10 ** r.uniform(-10, -4)), str(r.choice(["auto", "auto", "xla", "dense"]))
+    motion = _asked(Lawful(), parameters, start, way, ts=ts, rtol=rtol, backend=backend)
+    off = abs(np.hypot(*np.asarray(motion.u_end)) - (1 - 2 / parameters["stop"]))
+    error = off / 1e-3 if parameters["stop"] > 2 else np.inf
+    return f"{way}: {parameters}, {count} times, {backend}", error, int(motion.result), warnings_of(motion)
 
 
 # Starts outside the domain. ---------------------------------------------------------------------------------
@@ -210,11 +190,8 @@ class CrankAndSlider(jj.Scene):
     domain = {"crank": (-1.2, 1.2), "slide": (0.7, 2.6)}
 
     def bodies(self, t, q):
-        pin = jnp.stack([jnp.cos(q.crank), jnp.sin(q.crank), 0.0 * q.crank])
-        return {
-            "pin": jj.Particle(1.0, pin),
-            "slider": jj.Particle(1.0, jnp.stack([q.slide, 0.0 * q.slide, 0.0 * q.slide])),
-        }
+        pin = [jnp.cos(q.crank), jnp.sin(q.crank), 0.0]
+        return {"pin": jj.Particle(1.0, pin), "slider": jj.Particle(1.0, [q.slide, 0.0, 0.0])}
 
     def geometric_constraints(self, pose):
         return {"rod": jj.rod(pose["pin"].position, pose["slider"].position, self.length)}
@@ -226,17 +203,14 @@ class Hanging(SphericalPendulum):
     domain = {"x": (-0.7, 0.7), "y": (-0.7, 0.7), "z": (-1.3, -0.3)}
 
 
-def _outside(seed: int):
+def _outside(seed):
     """What `start` finds lies in the domain (a tenth of its width beyond is let pass), or it is refused."""
     r = np.random.default_rng([seed, 91])
-    scene = (CrankAndSlider, Hanging)[seed % 2](
-        length=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2)
-    )
-    named = (
-        {"crank": r.uniform(-1.0, 1.0)}
-        if seed % 2 == 0
-        else {"x": r.uniform(-0.5, 0.5), "y": r.uniform(-0.5, 0.5)}
-    )
+    if seed % 2:
+        scene, near = Hanging(length=r.uniform(0.8, 1.2)), {"x": (-0.5, 0.5), "y": (-0.5, 0.5)}
+    else:
+        scene, near = CrankAndSlider(length=r.uniform(1.25, 1.6)), {"crank": (-1.0, 1.0)}
+    named = drawn(**near)(r)
     state = jj.start(scene, named)
     q = dict(zip(scene.coordinate_names.entries, np.asarray(state.q), strict=True))
     off = max(max(low - q[name], q[name] - high) / (high - low) for name, (low, high) in scene.domain.items())
@@ -245,55 +219,21 @@ def _outside(seed: int):
 
 # Robot files. -----------------------------------------------------------------------------------------------
 
-ARM = """<robot name="arm">
-  <link name="base"/>
-  <link name="upper"><inertial><origin xyz="0 0 -0.5"/><mass value="2.0"/>
-    <inertia ixx="0.17" iyy="0.17" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
-    <dynamics damping="0.3"/></joint>
-</robot>"""
-FAULTS = (
-    ("axis as text", '<axis xyz="0 1 0"/>', "<axis>0 1 0</axis>"),
-    ("axis as an element of SDF", '<axis xyz="0 1 0"/>', "<axis><xyz>0 1 0</xyz></axis>"),
-    ("two axes", '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><axis xyz="1 0 0"/>'),
-    ("two dynamics", '<dynamics damping="0.3"/>', '<dynamics damping="0.3"/><dynamics damping="3"/>'),
-    ("a spring", '<dynamics damping="0.3"/>', '<dynamics damping="0.3" spring="9"/>'),
-    ("a misspelt damping", 'damping="0.3"', 'dampnig="0.3"'),
-    (
-        "two inertials",
-        "</inertial>",
-        (
-            '</inertial><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"'
-            ' iyz="0"/></inertial>'
-        ),
-    ),
-    ("two links of one name", '<link name="base"/>', '<link name="base"/><link name="upper"/>'),
-    (
-        "a loop joint",
-        "</robot>",
-        '<loop_joint name="l" type="revolute"><link1 link="base"/><link2 link="upper"/></loop_joint></robot>',
-    ),
-    ("a force element", "</robot>", '<force_element name="f"><spring k="3"/></force_element></robot>'),
-    ("a mass as text", '<mass value="2.0"/>', "<mass>2.0</mass>"),
-    ("a number of Python's", 'value="2.0"', 'value="2_0"'),
-    ("digits of another script", 'value="2.0"', 'value="\u0662"'),
-    ("a moment above the others", 'izz="0.01"', 'izz="0.9"'),
-    ("a misspelt product", 'ixz="0"', 'izx="0"'),
-    ("two origins", '<origin xyz="0 0 -0.5"/>', '<origin xyz="0 0 -0.5"/><origin xyz="0 0 0.5"/>'),
-    (
-        "an angle of the frame in degrees",
-        '<origin xyz="0 0 -0.5"/>',
-        '<origin xyz="0 0 -0.5" rpy_deg="90 0 0"/>',
-    ),
-)
+TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+ARM, FAULTS = TEXTS["arm"], TEXTS["faults"]
 
 
-def _robot(seed: int):
-    what, old, new = FAULTS[seed % len(FAULTS)]
+def _heard(call):
+    """What a call returns, and its warnings in one line."""
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        scene = jj.from_urdf(ARM.replace(old, new, 1))
-    said = "; ".join(str(w.message).splitlines()[0] for w in heard)
+        found = call()
+    return found, "; ".join(str(w.message).splitlines()[0] for w in heard)
+
+
+def _robot(seed):
+    what, old, new = FAULTS[seed % len(FAULTS)]
+    scene, said = _heard(lambda: jj.from_urdf(ARM.replace(old, new, 1)))
     return f"{what} in a URDF file: {scene.__name__}", np.inf, 0, said
 
 
@@ -301,62 +241,42 @@ def _robot(seed: int):
 
 
 @cache
-def _study() -> tuple[Path, dict]:
+def _study():
     path = Path(tempfile.mkdtemp()) / "discs.zarr"
-    study = jj.Study(
-        jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3
-    )
-    result = study.run(
-        path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": End("lean", "rad")}, progress=False
-    )
-    return path, _facts(result)
+    start, outputs = {"lean": Uniform(-0.5, 0.5), "spin_rate": -2.0}, {"lean": End("lean", "rad")}
+    study = jj.Study(jj.models.TiltingDisc(), start=start, samples=64, seed=3)
+    return path, _facts(study.run(path, t1=0.2, rtol=1e-6, atol=1e-6, outputs=outputs, progress=False))
 
 
-def _facts(result) -> dict:
-    found = result.statistics
-    numbers = {
-        "mean": found.mean,
-        "covariance": found.covariance,
-        "counts": found.counts,
-        "edges": found.histogram("lean")[1],
-    }
-    return {name: x.tolist() for name, x in numbers.items()} | {
-        "values": result.to_xarray()["lean"].values.tolist(),
-        "complete": result.complete,
-    }
+def _facts(result):
+    told = result.statistics
+    numbers = {name: getattr(told, name) for name in ("mean", "covariance", "counts")}
+    numbers |= {"edges": told.histogram("lean")[1], "values": result.to_xarray()["lean"].values}
+    return {name: x.tolist() for name, x in numbers.items()} | {"complete": result.complete}
 
 
-def _study_file(seed: int):
+def _study_file(seed):
     """One character of one file of a study's folder is another: the study says so, or its numbers are what
     they were.
     """
     r = np.random.default_rng([seed, 92])
     path, before = _study()
     files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size and "lock" not in p.name)
-    kinds = sorted({re.sub(r"\d+", "0", str(p.relative_to(path))) for p in files})
+    kind_of = lambda file: re.sub(r"\d+", "0", str(file.relative_to(path)))
+    kinds = sorted({*map(kind_of, files)})
     kind = kinds[seed % len(kinds)]
-    changed = r.choice([p for p in files if re.sub(r"\d+", "0", str(p.relative_to(path))) == kind])
+    changed = r.choice([file for file in files if kind_of(file) == kind])
     whole = changed.read_bytes()
-    digits = [k for k, byte in enumerate(whole) if 48 <= byte <= 57] or list(range(len(whole)))
-    at = int(r.choice(digits))
-    other = (
-        bytes([48 + (whole[at] - 48 + int(r.integers(1, 10))) % 10])
-        if 48 <= whole[at] <= 57
-        else bytes([whole[at] ^ 1])
-    )
-    changed.write_bytes(whole[:at] + other + whole[at + 1 :])
+    digits = [k for k, byte in enumerate(whole) if 48 <= byte <= 57]
+    at = int(r.choice(digits or range(len(whole))))
+    other = 48 + (whole[at] - 48 + int(r.integers(1, 10))) % 10 if digits else whole[at] ^ 1
+    changed.write_bytes(whole[:at] + bytes([other]) + whole[at + 1 :])
     try:
-        with warnings.catch_warnings(record=True) as heard:
-            warnings.simplefilter("always")
-            result = jj.load_study(path)
-            after, shown = _facts(result), str(result)
-        same = json.dumps(after) == json.dumps(before)
-        said = "; ".join(str(w.message).splitlines()[0] for w in heard) or (
-            "" if after["complete"] else shown.splitlines()[0]
-        )
+        (after, shown), said = _heard(lambda: (_facts(result := jj.load_study(path)), str(result)))
     finally:
         changed.write_bytes(whole)
-    return f"byte {at} of {kind}", 0.0 if same else np.inf, 0, said
+    said = said or ("" if after["complete"] else shown.splitlines()[0])
+    return f"byte {at} of {kind}", 0.0 if json.dumps(after) == json.dumps(before) else np.inf, 0, said
 
 
 # Machine code on disk. --------------------------------------------------------------------------------------
@@ -370,14 +290,14 @@ print(json.dumps([motion.q_end.tolist() for motion in motions]))
 """
 
 
-def _run_twice(folder: Path):
+def _run_twice(folder):
     try:
         return fresh(TWO_MOTIONS, JOURDAIN_JAX_CACHE=str(folder))
     except RuntimeError as error:
         return str(error)
 
 
-def _cache_file(seed: int):
+def _cache_file(seed):
     """Files of machine code are exchanged, torn, or hold something else: the next process returns the same
     motions.
     """

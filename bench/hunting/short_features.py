@@ -7,10 +7,10 @@ Motions are free between the features, where nothing bounds a step but the rules
 import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from small_scenes import OnLine, OnPlane
+from small_scenes import InSpace, OnLine, OnPlane
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, G, drawn, stopped
+from hunting.family import Ask, Family, G, drawn, one_by_one, power, stopped
 from hunting.pendulums import Weighted
 
 
@@ -26,7 +26,7 @@ class Strip(OnLine):
     def loads(self, motion):
         x = motion.q.x
         inside = (x > self.at) & (x < self.at + self.width)
-        return (jj.generalized_force(motion, x_rate=jnp.where(inside, -self.force, 0.0)),)
+        return jj.generalized_force(motion, x_rate=jnp.where(inside, -self.force, 0.0))
 
 
 class Pulse(Strip):
@@ -35,7 +35,7 @@ class Pulse(Strip):
     def loads(self, motion):
         since = motion.t - self.at
         push = self.force * jnp.sign(jnp.maximum(since, 0.0)) * jnp.where(since < self.width, 1.0, 0.0)
-        return (jj.generalized_force(motion, x_rate=push),)
+        return jj.generalized_force(motion, x_rate=push)
 
 
 class Bump(Strip):
@@ -44,10 +44,10 @@ class Bump(Strip):
     def bodies(self, t, q):
         phase = (q.x - self.at) / self.width
         rise = jnp.where((phase > 0.0) & (phase < 1.0), 1.0 - jnp.cos(2 * jnp.pi * phase), 0.0)
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.5 * self.force * rise]))}
+        return {"mass": jj.Particle(1.0, [q.x, 0.0, 0.5 * self.force * rise])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, G),)
+        return jj.gravity(motion, G)
 
 
 def _strip_truth(n, ts):
@@ -68,60 +68,39 @@ def _pulse_truth(n, ts):
     return n.x_rate * ts + n.force * (during**2 / 2 + during * after), n.x_rate + n.force * during
 
 
+@one_by_one
 def _bump_truth(n, ts):
     """xdot^2 (1 + z'^2) + 2 g z = v^2; the time over the bump by quadrature, of order 10 in 400 pieces."""
-    found = np.empty((2, *ts.shape))
+    v, h, a, w = n.x_rate, n.force, n.at, n.width
+
+    def speed(x):
+        phase = 2 * np.pi * (x - a) / w
+        z, slope = h / 2 * (1 - np.cos(phase)), h * np.pi / w * np.sin(phase)
+        return np.sqrt((v * v - 2 * G * z) / (1 + slope**2))
+
     nodes, weights = np.polynomial.legendre.leggauss(5)
-    for i, times in enumerate(ts):
-        v, h, a, w = (float(x[i, 0]) for x in (n.x_rate, n.force, n.at, n.width))
-
-        def speed(x, v=v, h=h, a=a, w=w):
-            phase = 2 * np.pi * (x - a) / w
-            z, slope = h / 2 * (1 - np.cos(phase)), h * np.pi / w * np.sin(phase)
-            return np.sqrt((v * v - 2 * G * z) / (1 + slope**2))
-
-        grid = np.linspace(a, a + w, 401)
-        half = np.diff(grid)[:, None] / 2
-        passed = np.sum(weights * half / speed((grid[1:] + grid[:-1])[:, None] / 2 + half * nodes), axis=1)
-        at = a / v + np.concatenate([[0.0], np.cumsum(passed)])
-        x = np.where(times < at[0], v * times, a + w + v * (times - at[-1]))
-        over = (times >= at[0]) & (times <= at[-1])
-        x[over] = CubicHermiteSpline(at, grid, speed(grid))(times[over])
-        found[:, i] = x, np.where(over, speed(x), v)
-    return tuple(found)
+    grid = np.linspace(a, a + w, 401)
+    half = np.diff(grid)[:, None] / 2
+    passed = np.sum(weights * half / speed((grid[1:] + grid[:-1])[:, None] / 2 + half * nodes), axis=1)
+    at = a / v + np.concatenate([[0.0], np.cumsum(passed)])
+    x = np.where(ts < at[0], v * ts, a + w + v * (ts - at[-1]))
+    over = (ts >= at[0]) & (ts <= at[-1])
+    x[over] = CubicHermiteSpline(at, grid, speed(grid))(ts[over])
+    return np.stack([x, np.where(over, speed(x), v)], axis=1)
 
 
-def _strip_drawn(r):
-    v, width = r.uniform(1.0, 4.0), 10 ** r.uniform(-2.2, -0.7)
-    return {
-        "x_rate": v,
-        "width": width,
-        "force": r.uniform(0.1, 0.4) * v * v / (2 * width),
-        "at": r.uniform(0.5, 2.0),
-        "span": 3.0,
-    }
-
-
-def _pulse_drawn(r):
-    width = 3.0 * 10 ** r.uniform(-2.2, -0.9)
-    return {
-        "x_rate": r.uniform(-2.0, 2.0),
-        "width": width,
-        "force": r.uniform(-2.0, 2.0) / width,
-        "at": r.uniform(0.3, 2.5),
-        "span": 3.0,
-    }
-
-
-def _bump_drawn(r):
-    v, width = r.uniform(2.0, 4.0), 10 ** r.uniform(-1.5, -0.5)
-    return {
-        "x_rate": v,
-        "width": width,
-        "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)),
-        "at": r.uniform(0.5, 3.0),
-        "span": 3.0,
-    }
+STRIPS = drawn(
+    x_rate=(1.0, 4.0), width=power(-2.2, -0.7),
+    force=lambda r, n: r.uniform(0.1, 0.4) * n.x_rate * n.x_rate / (2 * n.width), at=(0.5, 2.0), span=3.0,
+)  # fmt: skip
+PULSES = drawn(
+    width=lambda r, n: 3.0 * 10 ** r.uniform(-2.2, -0.9), x_rate=(-2.0, 2.0),
+    force=lambda r, n: r.uniform(-2.0, 2.0) / n.width, at=(0.3, 2.5), span=3.0,
+)  # fmt: skip
+BUMPS = drawn(
+    x_rate=(2.0, 4.0), width=power(-1.5, -0.5),
+    force=lambda r, n: r.uniform(0.2, 0.5) * min(n.width, n.x_rate**2 / (2 * G)), at=(0.5, 3.0), span=3.0,
+)  # fmt: skip
 
 
 # Events with a short negative part. -------------------------------------------------------------------------
@@ -150,13 +129,7 @@ def _window_truth(n, ts):
     return stopped(lambda t: (n.x_rate * t, n.x_rate), t_end, ["near"] * len(t_end), ts)
 
 
-def _window_drawn(r):
-    return {
-        "x_rate": r.uniform(0.7, 4.0),
-        "at": r.uniform(0.5, 2.0),
-        "width": 10 ** r.uniform(-4.0, -1.0),
-        "span": 3.0,
-    }
+WINDOWS = drawn(x_rate=(0.7, 4.0), at=(0.5, 2.0), width=power(-4.0, -1.0), span=3.0)
 
 
 # Speeds and constraints that lose their slope. --------------------------------------------------------------
@@ -192,20 +165,16 @@ def _turned(name, scene, weight, weight_of_start, first):
         names="q w", cases=40,
         truth=lambda n, ts: (n.q + n.rate * ts, weight(n.q + n.rate * ts) * n.rate),
         start=lambda n: {"w": weight_of_start(n.q) * n.rate},
-        draw=drawn(q=first, rate=lambda r: -r.uniform(0.5, 2.0), span=(0.3, 3.0)),
+        draw=drawn(q=first, rate=lambda r, n: -r.uniform(0.5, 2.0), span=(0.3, 3.0)),
     )  # fmt: skip
 
 
-class EvenPace(Weighted):
+class EvenPace(Weighted, InSpace):
     """Appell and Hamel's constraint zdot^2 = k^2 (xdot^2 + ydot^2): without slope where the speeds vanish, at
     the top of the throw.
     """
 
-    coordinates = jj.coordinates("x y z")
     slope: object = jj.parameter(1.0)
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, q.array)}
 
     def velocity_constraints(self, motion):
         u = motion.u
@@ -222,15 +191,10 @@ def _pace_truth(n, ts):
     return c * z / k, s * z / k, z, c * up / k, s * up / k, up
 
 
-def _pace_drawn(r):
-    k, v = r.uniform(0.5, 2.0), r.uniform(1.0, 3.0)
-    top = k * v / (G * k * k / (1 + k * k))
-    return {
-        "slope": k,
-        "v": v,
-        "turn": r.uniform(0.0, 6.0),
-        "span": float(r.choice([0.7, r.uniform(1.2, 2.0)])) * top,
-    }
+def _until_top(r, n):
+    """A share of the time to the top, or beyond it."""
+    k = n.slope
+    return r.choice([0.7, r.uniform(1.2, 2.0)]) * (k * n.v / (G * k * k / (1 + k * k)))
 
 
 class SetPace(OnPlane):
@@ -254,23 +218,24 @@ ASKS = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap", 3)
 LINE, ROWS = {"names": "x x_rate", "cases": 63}, {"cases": 42, "single": False, "asks": ASKS}
 FAMILIES = (
     Family(
-        "strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, **LINE,
+        "strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, STRIPS, _strip_truth, **LINE,
     ),
-    Family("pulse", "a force for 0.6 to 12 % of the span", Pulse, _pulse_drawn, _pulse_truth, **LINE),
+    Family("pulse", "a force for 0.6 to 12 % of the span", Pulse, PULSES, _pulse_truth, **LINE),
     Family(
-        "bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth,
+        "bump", "a flat road with a bump of 3 to 30 cm", Bump, BUMPS, _bump_truth,
         **LINE | {"cases": 42, "single": False},
     ),
     Family(
-        "window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth,
+        "window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, WINDOWS, _window_truth,
         **LINE,
     ),
-    Family("gate", "the same by `where`", Gate, _window_drawn, _window_truth, **LINE | {"cases": 42}),
+    Family("gate", "the same by `where`", Gate, WINDOWS, _window_truth, **LINE | {"cases": 42}),
     _turned("turned-speed", TurnedSpeed, np.sin, jnp.sin, (0.4, 1.5)),
     _turned("swing-speed", SwingSpeed, np.cos, jnp.cos, (-1.0, 1.0)),
     Family(
         name="even-pace", what="Appell and Hamel's constraint up to the top of the throw, and beyond",
-        scene=EvenPace, draw=_pace_drawn, truth=_pace_truth,
+        scene=EvenPace, truth=_pace_truth,
+        draw=drawn(slope=(0.5, 2.0), v=(1.0, 3.0), turn=(0.0, 6.0), span=_until_top),
         names="x y z x_rate y_rate z_rate", **ROWS,
         start=lambda n: {
             "x_rate": n.v * jnp.cos(n.turn), "y_rate": n.v * jnp.sin(n.turn), "z_rate": n.slope * n.v,

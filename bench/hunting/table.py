@@ -1,21 +1,20 @@
 """The table of a search, as text and as Markdown, and its figures."""
 
 from collections import Counter
-from collections.abc import Iterator
 
-from figures import figure
+from figures import figure, markdown
 
 from hunting.record import BY_CODE, BY_WARNING, CRASHED, LOST, OUTCOMES, REFUSED, RIGHT, WRONG
 
 
-def rows(records: list[dict]) -> Iterator[tuple]:
+def rows(records):
     """Family, cases, outcomes in their order, seconds; the sum at the end."""
     for name in sorted({r["family"] for r in records}):
         yield _row(name, [r for r in records if r["family"] == name])
     yield _row("all", records)
 
 
-def _row(name: str, own: list[dict]) -> tuple:
+def _row(name, own):
     counts = Counter(r["outcome"] for r in own)
     return (name, len(own), *(counts[outcome] for outcome in OUTCOMES), round(sum(r["seconds"] for r in own)))
 
@@ -23,21 +22,18 @@ def _row(name: str, own: list[dict]) -> tuple:
 HEAD = ("family", "cases", *OUTCOMES, "seconds")
 
 
-def as_markdown(records: list[dict]) -> Iterator[str]:
+def as_markdown(records):
     """Return the table of `bench/records/hunt.md`, with a description of each family."""
     from hunting.families import FAMILIES
 
     what = {f.name: f.what for f in FAMILIES}
-    yield from (f"| family | what | {' | '.join(HEAD[1:])} |", "|---|---|" + "---|" * (len(HEAD) - 1))
-    for row in rows(records):
-        yield (
-            f"| {row[0]} | {what.get(row[0], '')} | "
-            + " | ".join(str(entry) if entry or k == 0 else "" for k, entry in enumerate(row[1:]))
-            + " |"
-        )
+    shown = []
+    for name, count, *rest in rows(records):
+        shown.append((name, what.get(name, ""), count, *(entry or "" for entry in rest)))
+    return markdown(("family", "what", *HEAD[1:]), shown)
 
 
-def losses(records: list[dict]) -> Iterator[str]:
+def losses(records):
     """Every case that is wrong or crashed, with what repeats it alone."""
     for r in records:
         if r["outcome"] in LOST:
@@ -45,7 +41,7 @@ def losses(records: list[dict]) -> Iterator[str]:
             yield f"{r['outcome'].upper()}: {again}\n    {r['said']}\n    {r['asked']}"
 
 
-def figures(records: list[dict], wall: float) -> Iterator[dict]:
+def figures(records, wall):
     """Figures as in the other scripts."""
     for row in rows(records):
         counts = dict(zip(OUTCOMES, row[2:-1], strict=True))

@@ -5,11 +5,10 @@ next.
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, Truth, drawn, either, one_of
+from hunting.family import Ask, Family, drawn, either, one_by_one, one_of, piece
 
 MOST = 40
 
@@ -68,7 +67,7 @@ def _followed(n, ts):
 
     def falls(j):
         fall = lambda t, y: values(t, y)[j] - 2e-10 * off[j]
-        fall.terminal, fall.direction = True, 1 if off[j] else -1
+        fall.direction = 1 if off[j] else -1
         return fall
 
     for _ in range(3 * MOST):
@@ -85,27 +84,12 @@ def _followed(n, ts):
             else:
                 mode = 0
             continue
-        run = solve_ivp(
-            rates,
-            (t, ts[-1]),
-            y,
-            "DOP853",
-            rtol=1e-12,
-            atol=1e-13,
-            max_step=0.02,
-            events=[*map(falls, range(3))],
-            dense_output=True,
-        )
+        run = piece(rates, t, y, ts[-1], [*map(falls, range(3))])
         t, y = run.t[-1], run.y[:, -1]
         found += [run.sol(at) for at in ts[len(found) :] if way * at <= way * t]
         if len(found) == len(ts):
             return np.array(found)
     return np.full((len(ts), 4), np.nan)
-
-
-def _truth(n, ts):
-    cases = [type(n)(**{name: value[i, 0] for name, value in vars(n).items()}) for i in range(len(ts))]
-    return Truth(np.stack([_followed(one, own) for one, own in zip(cases, ts, strict=True)]))
 
 
 WAYS = ("simulate", "jit", "vmap", "rollout")
@@ -117,7 +101,7 @@ HOW = (
 FAMILIES = (
     Family(
         name="transitions", what="motions that go on after events, with modes and jumps", scene=Switched,
-        truth=_truth, names="x y x_rate y_rate",
+        truth=one_by_one(_followed), names="x y x_rate y_rate",
         draw=drawn(
             stiff=(3, 12), soft=(0.5, 3), cube=(0, 1), a=either(0.3, 1), b=(-0.5, 0.5),
             limit=one_of(0.3, (-0.1, 0.8)), kept=(0.3, 1), moved=(-0.1, 0.1),

@@ -4,8 +4,10 @@ tiny coefficients.
 
 import importlib
 import time
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,29 +29,27 @@ class Single:
 
     name: str
     what: str
-    ask: Callable[[int], tuple[str, float, int, str]]
+    ask: Callable
     cases: int = 20
     single: bool = False
 
-    def run(self, seeds: list[int]) -> list[Record]:
+    def run(self, seeds) -> list[Record]:
         """Records of the cases with these seeds."""
         found = []
         for seed in seeds:
-            begin = time.process_time()
+            begin, asked, error = time.process_time(), "", None
             try:
                 asked, error, code, said = self.ask(seed)
                 outcome = outcome_of(code, error, said)
                 said = f"code {code}" if outcome == BY_CODE else said
             except Exception as problem:
-                asked, error = "", None
                 outcome, said = refusal(problem)
-            found.append(
-                Record(self.name, seed, "float64", asked, outcome, error, said, time.process_time() - begin)
-            )
+            spent = time.process_time() - begin
+            found.append(Record(self.name, seed, "float64", asked, outcome, error, said, spent))
         return found
 
 
-def in_way(way: str, one: Callable, lanes: Callable, given):
+def in_way(way, one, lanes, given):
     """The motion by `one` or, of lanes, the last; inside `jit` where the way says so, with what is given
     traced.
     """
@@ -60,7 +60,7 @@ def in_way(way: str, one: Callable, lanes: Callable, given):
 # Times. -----------------------------------------------------------------------------------------------------
 
 
-def _times(seed: int):
+def _times(seed):
     """Times outside of the span, against it, or before the start: refused, flagged, NaN, or right at every
     one of them.
     """
@@ -68,7 +68,7 @@ def _times(seed: int):
     t0, way = float(r.choice([0.0, 0.8])), ("simulate", "rollout", "jit", "jit rollout")[seed % 4]
     ts = {0: [-0.5, 0.5, 1.0], 1: [0.5, 1.0], 2: [1.0, 0.5], 3: [0.2, 0.9, 1.6]}[seed // 4 % 4]
     t1 = 1.2 if seed // 16 % 2 else None
-    scene, options = Oscillator(), {"t0": t0, "rtol": 1e-8, "atol": 1e-8} | ({} if t1 is None else {"t1": t1})
+    scene, options = Oscillator(), {"t0": t0, "rtol": 1e-8, "atol": 1e-8, "t1": t1}
     start = {"x": r.uniform(0.5, 1.0), "x_rate": 0.0}
     asked = f"{way}, t0={t0}, t1={t1}, ts={ts}, x={start['x']!r}"
     many = {name: np.full(2, value) for name, value in start.items()}
@@ -84,33 +84,13 @@ def _times(seed: int):
 NOTEBOOK = """
 class Spring(Oscillator):
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-({read}) * motion.q.x),)
+        return jj.generalized_force(motion, x_rate=-({read}) * motion.q.x)
 """
-# what a cell of a notebook says, what the method reads, and what a later cell says; "" where the first is
-# refused already
-READ = {
-    "number": ("k = 1.0", "k", "k = {k}"),
-    "integer": ("k = 1", "k", "k = {k}"),
-    "tuple": ("k = (1.0, 2.0)", "k[0]", "k = ({k}, 2.0)"),
-    "function": ("def law(): return 1.0", "law()", "def law(): return {k}"),
-    "function of a number": ("law = lambda x: 1.0 * x", "law(1.0)", "law = lambda x: {k} * x"),
-    "list": ("k = [1.0]", "k[0]", ""),
-    "dictionary": ("k = {{'a': 1.0}}", "k['a']", ""),
-    "array": ("k = np.ones(3)", "k[1]", ""),
-    "array of JAX": ("k = jnp.ones(3)", "k[1]", ""),
-    "large array": ("k = np.ones(5000)", "k[4321]", ""),
-    "array of objects": ("k = np.array([1.0, None])", "k[0]", ""),
-    "deque": ("k = collections.deque([1.0])", "k[0]", ""),
-    "mapping": ("k = collections.UserDict(a=1.0)", "k['a']", ""),
-    "typed array": ("k = array.array('d', [1.0])", "k[0]", ""),
-    "namespace": ("k = types.SimpleNamespace(a=1.0)", "k.a", ""),
-    "arguments": ("k = argparse.Namespace(a=1.0)", "k.a", ""),
-    "context": ("k = contextvars.ContextVar('k', default=1.0)", "k.get()", ""),
-    "controller": ("class Law:\n    def update(self, x): return x\nk = Law()", "k.update(1.0)", ""),
-}
+# what a cell of a notebook says, what the method reads, and what a later cell says
+READ = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def _changed(seed: int):
+def _changed(seed):
     """The motion after a change of what a method reads is that of the new value, or what it reads is refused
     where it has state.
     """
@@ -118,36 +98,26 @@ def _changed(seed: int):
     kind, way = list(READ)[seed % len(READ)], ("simulate", "rollout")[seed // len(READ) % 2]
     k, (first, read, later) = r.uniform(2.0, 9.0), READ[kind]
     cell = {"Oscillator": Oscillator, "jj": jj, "np": np, "jnp": jnp, "__name__": "__main__"}
-    cell |= {
-        name: importlib.import_module(name)
-        for name in ("argparse", "array", "collections", "contextvars", "types")
-    }
+    modules = ("argparse", "array", "collections", "contextvars", "types")
+    cell |= {name: importlib.import_module(name) for name in modules}
     exec(first.format(k=1.0), cell)
     exec(NOTEBOOK.format(read=read), cell)
 
     def run():
-        one = lambda ts: jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=ts)
-        return in_way(
-            way,
-            one,
-            lambda ts: jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=ts).lanes,
-            [1.0],
-        )
+        one = lambda ts: jj.simulate(cell["Spring"](), {"x": 1.0}, ts=ts)
+        lanes = lambda ts: jj.rollout(cell["Spring"](), {"x": np.ones(2)}, ts=ts).lanes
+        return in_way(way, one, lanes, [1.0])
 
     motion = run()
     if not later:
         return f"{way}, {kind}", np.inf, int(motion.result), ""
     exec(later.format(k=repr(k)), cell)
     motion = run()
-    return (
-        f"{way}, {kind}, k={k!r}",
-        abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5,
-        int(motion.result),
-        warnings_of(motion),
-    )
+    off = abs(float(motion.q_end[0]) - np.cos(np.sqrt(k)))
+    return f"{way}, {kind}, k={k!r}", off / 1e-5, int(motion.result), warnings_of(motion)
 
 
-def warnings_of(motion) -> str:
+def warnings_of(motion):
     """What a motion warns of, in one line."""
     return "; ".join(jax.tree.map(jnp.asarray, motion).warnings)
 
@@ -168,14 +138,11 @@ class LateRow(OnPlane):
         return jnp.maximum(motion.t - self.late, 0.0)
 
     def velocity_constraints(self, motion):
-        u = motion.u
-        return {
-            "first": u.x_rate - 1.0,
-            "second": u.x_rate - 1.0 + self.passed(motion) * (u.y_rate - self.speed),
-        }
+        first = motion.u.x_rate - 1.0
+        return {"first": first, "second": first + self.passed(motion) * (motion.u.y_rate - self.speed)}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, y_rate=4.0 * jnp.maximum(motion.t - self.late, 0.0)),)
+        return jj.generalized_force(motion, y_rate=4.0 * jnp.maximum(motion.t - self.late, 0.0))
 
 
 class ElsewhereRow(LateRow):
@@ -201,7 +168,7 @@ class TinyForce(OnLine):
     """A force with a tiny coefficient that grows by e in a tenth of a metre."""
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-1e-24 * jnp.exp(motion.q.x / 0.1)),)
+        return jj.generalized_force(motion, x_rate=-1e-24 * jnp.exp(motion.q.x / 0.1))
 
 
 class BesideHugeForce(jj.Scene):
@@ -210,26 +177,20 @@ class BesideHugeForce(jj.Scene):
     coordinates = jj.coordinates("x y")
 
     def bodies(self, t, q):
-        return {
-            "bob": jj.Particle(1.0, jnp.stack([jnp.sin(q.x), 0.0 * q.x, -jnp.cos(q.x)])),
-            "block": jj.Particle(1.0, jnp.stack([0.0 * q.y, q.y, 0.0 * q.y])),
-        }
+        bob = jj.Particle(1.0, [jnp.sin(q.x), 0.0, -jnp.cos(q.x)])
+        return {"bob": bob, "block": jj.Particle(1.0, [0.0, q.y, 0.0])}
 
     def loads(self, motion):
         weight = -G * motion["bob"].body.mass * jnp.sin(motion.q.x)
-        return (jj.generalized_force(motion, x_rate=weight, y_rate=1e16 * jnp.cos(motion.t)),)
+        return jj.generalized_force(motion, x_rate=weight, y_rate=1e16 * jnp.cos(motion.t))
 
 
 def _pushed(push):
     return lambda n, ts: integrate(lambda _, x, v: (v, push(x)), (n.x, n.x_rate), ts)
 
 
-ALONE = {
-    "names": "x x_rate",
-    "cases": 20,
-    "single": False,
-    "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap")),
-}
+ASKS = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap"))
+ALONE = {"names": "x x_rate", "cases": 20, "single": False, "asks": ASKS}
 FAMILIES = (
     Single("times", "times before the start, against the span or beyond it", _times, 32),
     Single(
