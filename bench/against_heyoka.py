@@ -8,14 +8,13 @@ it, the methods in turn. Alone means one motion after another inside one compile
 of the other motions.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import diffrax
 import jax
 import numpy as np
 from baselines import heyoka_disc, heyoka_lowered
-from figures import Figures, figure, least_processor_time
+from figures import figure, least_processor_time
 from minimal_states import final_states
 
 import jourdain_jax as jj
@@ -30,7 +29,7 @@ REQUIRED = {"tilting-disc": 1.2, "chaplygin-sleigh": 1.2, "rattleback": 0.5, "wh
 REQUIRED_ALONE = 1.5
 
 
-def tolerance_at(wanted: float, run: Callable, starts, expected: np.ndarray) -> float:
+def tolerance_at(wanted, run, starts, expected):
     """The tolerance whose final states have an error, straight between points in logarithms."""
     before = None
     for tolerance in TOLERANCES:
@@ -44,7 +43,7 @@ def tolerance_at(wanted: float, run: Callable, starts, expected: np.ndarray) -> 
     raise ValueError(f"no tolerance down to {TOLERANCES[-1]:.0e} gives a final error of {wanted:.0e}")
 
 
-def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool) -> Figures:
+def compared(name, starts: jj.State, end, options, quick):
     """Figures of one model."""
     scene = jj.models.MODELS[name]()
     system, plain = heyoka_lowered.equations(scene), heyoka_lowered.states(scene, starts.q, starts.u)
@@ -96,7 +95,7 @@ def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool
                 yield figure(f"{who}, Taylor / Dopri8", name, seconds[own[1]] / seconds[own[0]])
 
 
-def _our_solvers(scene: jj.Scene, wanted: float, options: dict) -> list:
+def _our_solvers(scene: jj.Scene, wanted, options):
     """Dopri8, and Taylor series of the order for the tolerance that gives an error, some tenth of it, where
     they serve.
     """

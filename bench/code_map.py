@@ -29,11 +29,11 @@ import sys
 import threading
 import tokenize
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-from figures import Figures, figure, fresh, main
+from figures import figure, fresh, main
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "jourdain_jax"
@@ -48,27 +48,10 @@ SEAMS = tuple(
 )
 THROUGH = "evaluated_natively"  # the file of `tests` that runs a scalar program as machine code
 CACHES = {"cache", "lru_cache", "cached_property"}
-CONTAINERS = {
-    "dict",
-    "list",
-    "set",
-    "defaultdict",
-    "OrderedDict",
-    "Counter",
-    "WeakKeyDictionary",
-    "WeakValueDictionary",
-    "WeakSet",
-    "deque",
-}
-TRACERS = {
-    "is_traced",
-    "is_traced_type",
-    "nothing_is_traced",
-    "checked_unless_traced",
-    "Tracer",
-    "ConcretizationTypeError",
-    "TracerBoolConversionError",
-}
+CONTAINERS = {"dict", "list", "set", "defaultdict", "OrderedDict", "Counter", "deque"}
+CONTAINERS |= {f"Weak{kind}" for kind in ("KeyDictionary", "ValueDictionary", "Set")}
+TRACERS = {"is_traced", "is_traced_type", "nothing_is_traced", "checked_unless_traced", "Tracer"}
+TRACERS |= {"ConcretizationTypeError", "TracerBoolConversionError"}
 MOST_PARAMETERS = 8
 MOST_FILES = {"build": 70, "first": 35, "gradient": 50, "warm": 20}  # of the first model
 MODELS = ("tilting-disc", "skate", "whipple-bicycle")
@@ -81,7 +64,7 @@ TOKEN = re.compile(
 )
 
 
-def layers() -> tuple[str, ...]:
+def layers():
     """Return the layers from bottom to top, as `tests/test_layers.py` states them."""
     for node in ast.parse((ROOT / "tests" / "test_layers.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "LAYERS":
@@ -89,12 +72,12 @@ def layers() -> tuple[str, ...]:
     raise ValueError("tests/test_layers.py states no LAYERS")
 
 
-def packages() -> set[str]:
+def packages():
     """Return the names of the packages directly below the package."""
     return {path.parent.name for path in SOURCE.glob("*/__init__.py")}
 
 
-def statements(node: ast.AST) -> Iterator[ast.AST]:
+def statements(node: ast.AST):
     """Yield a node and all statements in it, without their expressions."""
     yield node
     for block in ("body", "orelse", "finalbody", "handlers", "cases"):
@@ -102,7 +85,7 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
             yield from statements(inner)
 
 
-def code_tokens(text: str) -> int:
+def code_tokens(text):
     """Return the number of code tokens of a file."""
     documented = {
         node.body[0].lineno
@@ -120,7 +103,7 @@ def code_tokens(text: str) -> int:
     return total
 
 
-def modules_imported(path: Path) -> set[str]:
+def modules_imported(path):
     """Return the names of the modules that a file imports, those of the package and of `tests` as far down as
     a file goes.
     """
@@ -135,19 +118,17 @@ def modules_imported(path: Path) -> set[str]:
 
 
 @cache
-def _file(module: str) -> Path | None:
+def _file(module) -> Path | None:
     """Return the file of a module of the package or of `tests`."""
     for root in (ROOT / "src", ROOT / "tests"):
-        for path in (
-            root.joinpath(*module.split(".")).with_suffix(".py"),
-            root.joinpath(*module.split("."), "__init__.py"),
-        ):
-            if path.is_file():
-                return path
+        path = root.joinpath(*module.split("."))
+        for file in (path.with_suffix(".py"), path / "__init__.py"):
+            if file.is_file():
+                return file
     return None
 
 
-def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
+def private_modules(path, known):
     """Return the modules of the package that a file of `tests` reaches, itself or through others there,
     beyond public ones and the seams.
     """
@@ -163,14 +144,13 @@ def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
 
 
 @cache
-def reaching() -> dict[str, list[str]]:
+def reaching():
     """Return the private modules that every test file reaches, by the name of the file, where there are
     any.
     """
     known: dict[Path, set[str]] = {}
-    found = {
-        path.name: sorted(private_modules(path, known)) for path in sorted((ROOT / "tests").glob("test_*.py"))
-    }
+    files = sorted((ROOT / "tests").glob("test_*.py"))
+    found = {path.name: sorted(private_modules(path, known)) for path in files}
     return {name: modules for name, modules in found.items() if modules}
 
 
@@ -182,32 +162,26 @@ def counted(tree: ast.Module) -> Counter:
         found["caches"] += name in CACHES
         found["tests for a tracer"] += name in TRACERS
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            named = [
-                x
-                for x in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
-                if x.arg not in ("self", "cls")
-            ]
-            found[f"functions with more than {MOST_PARAMETERS} parameters"] += len(named) > MOST_PARAMETERS
+            every = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+            many = sum(x.arg not in ("self", "cls") for x in every) > MOST_PARAMETERS
+            found[f"functions with more than {MOST_PARAMETERS} parameters"] += many
     for body in (tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))):
         for value in (node.value for node in body if isinstance(node, ast.Assign | ast.AnnAssign)):
             found["caches"] += body is tree.body and _is_empty(value)
-            found["named numbers"] += sum(
-                map(_is_number, value.elts if isinstance(value, ast.Tuple) else [value])
-            )
+            numbers = value.elts if isinstance(value, ast.Tuple) else [value]
+            found["named numbers"] += sum(map(_is_number, numbers))
     return found
 
 
-def _is_empty(value: ast.expr | None) -> bool:
+def _is_empty(value: ast.expr | None):
     """Return whether this makes a container with nothing in it."""
     if isinstance(value, ast.Call):
         name = getattr(value.func, "id", None) or getattr(value.func, "attr", None)
         return name in CONTAINERS and all(isinstance(argument, ast.Name) for argument in value.args)
-    return (isinstance(value, ast.Dict) and not value.keys) or (
-        isinstance(value, ast.List) and not value.elts
-    )
+    return value is not None and ast.unparse(value) in ("{}", "[]")
 
 
-def _is_number(value: ast.expr | None) -> bool:
+def _is_number(value: ast.expr | None):
     """Return whether this is a number, or worked out from one."""
     if isinstance(value, ast.BinOp):
         return _is_number(value.left) or _is_number(value.right)
@@ -216,41 +190,36 @@ def _is_number(value: ast.expr | None) -> bool:
     return isinstance(value, ast.Constant) and type(value.value) in (int, float)
 
 
-def figures_of_source() -> dict[str, int]:
+def figures_of_source():
     """Return what is read from the source."""
     found: Counter = Counter()
     for folder in FOLDERS:
         files = [path for path in sorted((ROOT / folder).rglob("*.py*")) if path.suffix in (".py", ".pyi")]
-        found[f"code tokens of {folder}"] = sum(
-            code_tokens(path.read_text(encoding="utf-8")) for path in files
-        )
+        texts = (path.read_text(encoding="utf-8") for path in files)
+        found[f"code tokens of {folder}"] = sum(map(code_tokens, texts))
     for path in sorted(SOURCE.rglob("*.py")):
         found += counted(ast.parse(path.read_text(encoding="utf-8")))
     found["test files that reach private names"] = len(reaching())
     return dict(found) | ways()
 
 
-def ways() -> dict[str, int]:
+def ways():
     """Return the number of ways of each fact that the page on the packages lists."""
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("\n## Ways\n")[1]
     rows = re.findall(r"^\| ([^|`]+) \| ([^|]*`[^|]*) \|$", page, re.MULTILINE)
     return {f"ways: {fact}": listed.count(";") + 1 for fact, listed in rows}
 
 
-def observed(call: Callable[[], object]) -> tuple[object, dict[str, int]]:
+def observed(call: Callable[[], object]):
     """Return what `call` returns, and calls of Python functions per file of the package."""
     files: Counter[str] = Counter()
     root = f"{SOURCE}/"
 
     def look(frame, event, argument):
-        path = frame.f_code.co_filename
-        if (
-            event == "call"
-            and path.startswith(root)
-            and frame.f_code.co_name != "<module>"
-            and not frame.f_code.co_flags & inspect.CO_GENERATOR
-        ):
-            files[path[len(root) :]] += 1
+        code = frame.f_code
+        own = event == "call" and code.co_filename.startswith(root) and code.co_name != "<module>"
+        if own and not code.co_flags & inspect.CO_GENERATOR:
+            files[code.co_filename[len(root) :]] += 1
 
     threading.setprofile(look)
     sys.setprofile(look)
@@ -262,7 +231,7 @@ def observed(call: Callable[[], object]) -> tuple[object, dict[str, int]]:
     return result, dict(files)
 
 
-def observed_calls(model: str) -> dict[str, dict[str, int]]:
+def observed_calls(model):
     """Return what the calls run for a model; for a process that has done nothing before."""
     import jax
 
@@ -280,26 +249,24 @@ def observed_calls(model: str) -> dict[str, dict[str, int]]:
         return jax.block_until_ready(jj.simulate(scene, start, t1=span))
 
     def slope():
-        return jax.block_until_ready(
-            jax.grad(lambda start: jj.simulate(scene, start, t1=span).q_end.sum())(start)
-        )
+        end = lambda start: jj.simulate(scene, start, t1=span).q_end.sum()
+        return jax.block_until_ready(jax.grad(end)(start))
 
     motion, first = observed(moved)
     motion.raise_if_failed()
     return {"build": built, "first": first, "gradient": observed(slope)[1], "warm": observed(moved)[1]}
 
 
-def source(quick: bool) -> Figures:
+def source(quick):
     """Yield what is read from the source."""
     yield from (figure(name, "all", value) for name, value in figures_of_source().items())
 
 
-def calls(quick: bool) -> Figures:
+def calls(quick):
     """Yield how much of the package runs, for every model."""
     for model in MODELS[: 1 if quick else None]:
-        found = fresh(
-            "import code_map, json, sys; print(json.dumps(code_map.observed_calls(sys.argv[1])))", model
-        )
+        program = "import code_map, json, sys; print(json.dumps(code_map.observed_calls(sys.argv[1])))"
+        found = fresh(program, model)
         for name, files in found.items():
             most = MOST_FILES[name] if model == MODELS[0] else None
             yield figure(f"files run, {name}", model, len(files), most)

@@ -22,7 +22,7 @@ Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`: thr
 import tempfile
 from functools import partial
 
-from figures import Figures, figure, fresh, main
+from figures import figure, fresh, main
 
 from jourdain_jax.models import MODELS
 
@@ -61,7 +61,7 @@ print(json.dumps(laps | {"total": sum(laps.values()) - laps["second"]}))
 """
 
 
-def times(name: str, quick: bool) -> Figures:
+def times(name, quick):
     """Those of a model, cold and with a warm cache."""
     with tempfile.TemporaryDirectory() as cache:
         caching = {

@@ -12,16 +12,16 @@ Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from figures import Figures, figure, main, seconds_of
+from figures import figure, main, seconds_of
+from small_scenes import Upright
 
 import jourdain_jax as jj
 
-jax.config.update("jax_enable_x64", True)
 NAME = "bouncing ball"
 RIGHT = 2.47360446364125, 8.53571984478680, 41.2871353427762  # s, and by e
 
 
-class Ball(jj.Scene):
+class Ball(Upright):
     """A ball above a floor, in a draught, so that eight numbers say how it moves."""
 
     bounce: float = jj.parameter(0.7, non_negative=True)
@@ -30,55 +30,41 @@ class Ball(jj.Scene):
     draught: float = jj.parameter(0.0)
     slope: float = jj.parameter(0.0)
     mass: float = jj.parameter(1.0, positive=True)
-    coordinates = jj.coordinates("x z")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def loads(self, motion):
         along = self.drag * (self.draught - motion.u.x_rate)
-        return jj.gravity(motion, self.gravity), jj.Load(
-            forces={"ball": jnp.stack([along, 0.0 * along, 0.0 * along])}
-        )
+        return jj.gravity(motion, self.gravity), jj.generalized_force(motion, x_rate=along)
 
     def events(self, motion):
-        return {
-            "floor": jj.Event(
-                motion.q.z - self.slope * motion.q.x, jump={"z_rate": -self.bounce * motion.u.z_rate}
-            )
-        }
+        jump = {"z_rate": -self.bounce * motion.u.z_rate}
+        return {"floor": jj.Event(motion.q.z - self.slope * motion.q.x, jump=jump)}
 
 
 def bounces(e, most=60, tolerance=1e-12):
     """Return the times of the bounces, as many as there may be."""
-    return jj.simulate(
-        Ball(e), {"z": 1.0}, ts=[2.52], rtol=tolerance, atol=tolerance, max_transitions=most
-    ).phases.ts
+    options = {"rtol": tolerance, "atol": tolerance, "max_transitions": most}
+    return jj.simulate(Ball(e), {"z": 1.0}, ts=[2.52], **options).phases.ts
 
 
-def digits(quick: bool) -> Figures:
+def digits(quick):
     """Errors of the time of the tenth bounce and of its derivatives by e, and of the energy."""
     tenth = lambda e: bounces(e)[9]
-    found = (
-        tenth(0.7),
-        max(abs(f(tenth)(0.7) - RIGHT[1]) for f in (jax.grad, jax.jacfwd)) + RIGHT[1],
-        jax.hessian(tenth)(0.7),
-    )
-    for name, value, right, required in zip(
-        ("time", "d/de", "d2/de2"), found, RIGHT, (1e-12, 1e-10, 1e-8), strict=True
-    ):
-        yield figure(f"ten bounces, {name}: error", NAME, abs(value - right), required)
+    time, first, second = RIGHT
+    off = max(abs(f(tenth)(0.7) - first) for f in (jax.grad, jax.jacfwd))
+    yield figure("ten bounces, time: error", NAME, abs(tenth(0.7) - time), 1e-12)
+    yield figure("ten bounces, d/de: error", NAME, off, 1e-10)
+    yield figure("ten bounces, d2/de2: error", NAME, abs(jax.hessian(tenth)(0.7) - second), 1e-8)
     motion = jj.simulate(Ball(), {"z": 1.0}, t1=2.5, rtol=1e-12, atol=1e-12)
     balance = motion.energies().balance
     yield figure("energy audit, of the energy", NAME, np.ptp(balance) / 9.81, 1e-9)
 
 
-def seconds(call, *arguments) -> float:
+def seconds(call, *arguments):
     """Return the shortest processor time of a warm call."""
     return min(seconds_of(lambda: call(*arguments))[1] for _ in range(8))
 
 
-def times(quick: bool) -> Figures:
+def times(quick):
     """Time of a lane with ten bounces and more, and of derivatives by eight numbers through twelve, in
     solves.
     """
@@ -87,9 +73,8 @@ def times(quick: bool) -> Figures:
     yield figure("a lane with ten bounces, us", NAME, 1e6 * lanes / len(e), 5.0)
 
     def last(x):
-        motion = jj.simulate(
-            Ball(*x[:6]), {"z": x[6], "x_rate": x[7]}, ts=[2.52], rtol=1e-8, atol=1e-8, max_transitions=60
-        )
+        options = {"ts": [2.52], "rtol": 1e-8, "atol": 1e-8, "max_transitions": 60}
+        motion = jj.simulate(Ball(*x[:6]), {"z": x[6], "x_rate": x[7]}, **options)
         return motion.phases.ts[11] + motion.q[-1, 0]
 
     at = jnp.array([0.7, 9.81, 0.1, 0.3, 0.02, 1.0, 1.0, 0.5])
@@ -97,12 +82,11 @@ def times(quick: bool) -> Figures:
     solve = seconds(jax.jit(jax.vmap(last)), lanes)
     for name, derivative, required in (("forward", jax.jacfwd, 6.0), ("reverse", jax.grad, 8.0)):
         taken = seconds(jax.jit(jax.vmap(derivative(last))), lanes)
-        yield figure(
-            f"gradient by 8 numbers through 12 events, {name}, solves", NAME, taken / solve, required
-        )
+        what = f"gradient by 8 numbers through 12 events, {name}, solves"
+        yield figure(what, NAME, taken / solve, required)
 
 
-def fits(quick: bool) -> Figures:
+def fits(quick):
     """Share of 95 % intervals that hold the truth, of fits to noisy heights of a bouncing ball."""
     ts, repeats = jnp.linspace(0.0, 1.6, 81), 100 if quick else 500
     noise = 0.004 * jax.random.normal(jax.random.PRNGKey(0), (repeats, len(ts)))
@@ -111,13 +95,8 @@ def fits(quick: bool) -> Figures:
     found = jj.fit_batch(Ball(0.7, 9.7), throws, free=("bounce", "gravity")).estimates
     for name, right in (("bounce", 0.72), ("gravity", 9.81)):
         held = (found[name].low <= right) & (right <= found[name].high)
-        off = abs(np.mean(held) - 0.95)
-        yield figure(
-            f"share of intervals that hold `{name}`, off 0.95",
-            NAME,
-            off,
-            0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5,
-        )
+        off, most = abs(np.mean(held) - 0.95), 0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5
+        yield figure(f"share of intervals that hold `{name}`, off 0.95", NAME, off, most)
 
 
 class Bowling(jj.Scene):
@@ -127,23 +106,17 @@ class Bowling(jj.Scene):
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
-        return {
-            "ball": jj.RigidBody.ball(
-                6.8,
-                0.108,
-                position=jnp.stack([q.x, q.y, q.z]),
-                orientation=jj.quaternion_to_matrix(q.attitude),
-            )
-        }
+        at = {"position": [q.x, q.y, q.z], "orientation": jj.quaternion_to_matrix(q.attitude)}
+        return {"ball": jj.RigidBody.ball(6.8, 0.108, **at)}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def contacts(self, pose):
         return {"lane": jj.ball_contact(pose["ball"], 0.108, height="row", friction=self.friction)}
 
 
-def slips(quick: bool) -> Figures:
+def slips(quick):
     """Balls that slide in two directions: how many come to roll, and when slip w0 ends against 2 |w0|/(7 mu
     g).
     """
@@ -166,15 +139,12 @@ def slips(quick: bool) -> Figures:
 
     def right(numbers):
         slip = jnp.stack([numbers[1], 0.7])
-        duration = 2 / (7 * numbers[0] * 9.81)  # in |w0|
-        return slip * (
-            jnp.hypot(*slip) * duration * (1 - 0.5 * 2 / 7) + 5 / 7 * (6.0 - jnp.hypot(*slip) * duration)
-        )
+        duration = 2 * jnp.hypot(*slip) / (7 * numbers[0] * 9.81)
+        return slip * (duration * (1 - 0.5 * 2 / 7) + 5 / 7 * (6.0 - duration))
 
     numbers = jnp.array([0.12, 8.0])
-    yield figure(
-        "x(6 s), y(6 s): error, m", "bowling ball", jnp.max(jnp.abs(end(numbers) - right(numbers))), 1e-10
-    )
+    off = jnp.max(jnp.abs(end(numbers) - right(numbers)))
+    yield figure("x(6 s), y(6 s): error, m", "bowling ball", off, 1e-10)
     for name, derivative in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
         off = jnp.max(jnp.abs(derivative(end)(numbers) - jax.jacfwd(right)(numbers)))
         yield figure(f"d/dmu, d/dv0 of x, y: error, {name}", "bowling ball", off, 1e-8)

@@ -19,13 +19,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from figures import HERE, Figures, figure, main, seconds_of
+from figures import figure, main, seconds_of
 from jax.interpreters import mlir
 
 import jourdain_jax as jj
@@ -45,12 +44,11 @@ def disc(spin_rate, t1=2.0, scene=DISC, **options):
 
 
 def bicycle(lean_rate, scene=BICYCLE):
-    return jj.simulate(
-        scene, {**BICYCLE.upright(4.6), "lean_rate": lean_rate}, ts=[2.0], rtol=1e-6, atol=1e-6, work=False
-    )
+    start = BICYCLE.upright(4.6) | {"lean_rate": lean_rate}
+    return jj.simulate(scene, start, ts=[2.0], rtol=1e-6, atol=1e-6, work=False)
 
 
-def ends(run: Callable) -> Callable:
+def ends(run):
     def of(x):
         found = run(x)
         return found.q_end, found.t_end, found.result
@@ -93,46 +91,42 @@ ASSEMBLED = {
 OTHERS = sorted(set(jj.models.MODELS) - set(NAMES.values()))
 
 
-def functions_of(of: str) -> dict[str, Callable]:
+def functions_of(of):
     """Return values, a tangent, a gradient and second derivatives of a model's motion, as functions of the
     varied number.
     """
     from ends_of_models import end_of_model
 
-    numbers = [
-        p for p, value, _ in parameters_of(jj.models.MODELS[NAMES.get(of, of)]()) if np.ndim(value) == 0
-    ]
-    end, x = end_of_model(NAMES.get(of, of), None, numbers[:1], ts=[0.1, 0.2])
+    model = NAMES.get(of, of)
+    numbers = [p for p, value, _ in parameters_of(jj.models.MODELS[model]()) if np.ndim(value) == 0]
+    end, x = end_of_model(model, None, numbers[:1], ts=[0.1, 0.2])
     along = lambda s: end(x + s)
-    forms = along, jax.jacfwd(along), lambda s: jax.grad(end)(x + s), lambda s: jax.hessian(end)(x + s)
-    found = dict(zip((*FORMS, SECOND), forms, strict=True))
+    found = {"values": along, "tangent": jax.jacfwd(along)}
+    found |= {"gradient": lambda s: jax.grad(end)(x + s), SECOND: lambda s: jax.hessian(end)(x + s)}
     return found | {name: function for name, (_, function) in KINDS.get(of, {}).items()}
 
 
-def spread(of: str, lanes: int) -> jax.Array:
+def spread(of, lanes) -> jax.Array:
     """Return the number of each lane."""
     return jnp.linspace(*SPREAD.get(of, (0.0, 0.01)), lanes)
 
 
-def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
+def calls_of(f, lanes, of):
     """Every call of machine code in `f` of so many spread lanes on the CPU, with its arguments and
     results.
     """
-    calls: list[tuple] = []
+    calls = []
 
     def lowered(ctx, *values, handler, lanes, threads, operands, **how):
         results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ctx.avals_out]
         how |= {"handler": handler, "lanes": lanes, "threads": threads, "operands": operands}
 
+        def note(given, found):
+            calls.append((how, [*map(np.asarray, given)], [*map(np.asarray, found)]))
+
         def call(*values):
             found = jax.ffi.ffi_call(handler(lanes, threads), results)(*operands.side_by_side(*values))
-            jax.debug.callback(
-                lambda given, found: calls.append(
-                    (how, [*map(np.asarray, given)], [*map(np.asarray, found)])
-                ),
-                values,
-                found,
-            )
+            jax.debug.callback(note, values, found)
             return found
 
         return mlir.lower_fun(call)(ctx, *values)
@@ -149,84 +143,66 @@ def calls_of(f: Callable, lanes: int, of: str) -> list[tuple]:
     return calls
 
 
-def bits(of: str, name: str, quick: bool) -> Figures:
+def bits(of, name, quick):
     """How many numbers that kernels return differ in a bit from those of the CPU."""
     lanes, differ, count = 10_000, 0, 0
     for how, given, expected in calls_of(functions_of(of)[name], lanes, of):
         found = jax.jit(lambda *x, how=how: value_kernels._call_p.bind(*x, **how))(*given)
-        for ours, theirs in zip(found, expected, strict=True):
-            differ += int(
-                np.sum(np.asarray(ours).view(np.int64) != theirs.view(np.int64))
-                - np.sum(np.isnan(ours) & np.isnan(theirs))
-            )
+        for ours, theirs in zip(map(np.asarray, found), expected, strict=True):
+            differ += int(np.sum(ours.view(np.int64) != theirs.view(np.int64)))
+            differ -= int(np.sum(np.isnan(ours) & np.isnan(theirs)))
             count += theirs.size
-    yield figure(
-        f"numbers of {count} that differ in a bit, {name}", f"{lanes} lanes, {of}", max(differ, 0), 0
-    )
+    what = f"numbers of {count} that differ in a bit, {name}"
+    yield figure(what, f"{lanes} lanes, {of}", max(differ, 0), 0)
 
 
-def speed(of: str, name: str, lanes: int, quick: bool) -> Figures:
+def speed(of, name, lanes, quick):
     """Motions a second."""
     if quick and (of, name) == ("bicycle", "gradient"):
         lanes = 20_000
     (low, high), (required, function), model = SPREAD[of], KINDS[of][name], f"{lanes:g} lanes of a {of}"
     run = jax.jit(lambda: jax.vmap(function)(low + (high - low) * jnp.arange(lanes) / lanes))
-    _, first = seconds_of(run, time.perf_counter)
-    seconds = min(seconds_of(run, time.perf_counter)[1] for _ in range(3))
-    yield figure(
-        f"motions a second, {name}", model, lanes / seconds, least=required if lanes >= 1e5 else None
-    )
+    first, seconds = first_and_least(run, 3)
+    least = required if lanes >= 1e5 else None
+    yield figure(f"motions a second, {name}", model, lanes / seconds, least=least)
     yield figure(f"first call, s, {name}", model, first)
 
 
-def alone(
-    of: str, name: str, x: float, required: float | None, first_within: float | None, quick: bool
-) -> Figures:
+def first_and_least(run, repeats):
+    """Return the wall time of the first call, and the least of later ones, s."""
+    first, *others = (seconds_of(run, time.perf_counter)[1] for _ in range(1 + repeats))
+    return first, min(others)
+
+
+def alone(of, name, x, required, first_within, quick):
     """One motion."""
-    run = partial(jax.jit(KINDS[of][name][1]), x)
-    yield figure(
-        f"compiled and run, s, {name}", f"one {of}", seconds_of(run, time.perf_counter)[1], first_within
-    )
-    yield figure(
-        f"time, ms, {name}",
-        f"one {of}",
-        1e3 * min(seconds_of(run, time.perf_counter)[1] for _ in range(20)),
-        required,
-    )
+    first, seconds = first_and_least(partial(jax.jit(KINDS[of][name][1]), x), 20)
+    yield figure(f"compiled and run, s, {name}", f"one {of}", first, first_within)
+    yield figure(f"time, ms, {name}", f"one {of}", 1e3 * seconds, required)
 
 
-def study(lanes: int, least: float | None, quick: bool) -> Figures:
+def study(lanes, least, quick):
     """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is
     stored.
     """
     of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": Uniform(*SPREAD["disc"])}, samples=lanes)
     with tempfile.TemporaryDirectory() as folder:
-        run = partial(
-            of.run, t1=2.0, rtol=1e-6, atol=1e-6, save="statistics", keep_every=1000, progress=False
-        )
+        how = {"t1": 2.0, "rtol": 1e-6, "atol": 1e-6, "save": "statistics", "keep_every": 1000}
+        run = partial(of.run, progress=False, **how)
         seconds = min(seconds_of(partial(run, f"{folder}/{k}"), time.perf_counter)[1] for k in range(2))
-    yield figure(
-        "motions a second, statistics of a study, one lane in a thousand stored",
-        f"{lanes:g} discs",
-        lanes / seconds,
-        least=least,
-    )
+    what = "motions a second, statistics of a study, one lane in a thousand stored"
+    yield figure(what, f"{lanes:g} discs", lanes / seconds, least=least)
 
 
-def failures(quick: bool) -> Figures:
+def failures(quick):
     """A lane that is no number leaves the others alone; what does not fit into memory is an error, after
     which all goes on.
     """
     x = jnp.linspace(-6.0, -3.0, 1000)
     run = jax.jit(jax.vmap(DISCS["values"][1]))
     good, bad = run(x), run(x.at[500].set(jnp.nan))
-    others = jnp.arange(1000) != 500
-    yield figure(
-        "lanes beside a failed one that changed",
-        "1000 discs",
-        int(jnp.sum(jnp.any(good[0] != bad[0], axis=1) & others)),
-        0,
-    )
+    changed = jnp.any(good[0] != bad[0], axis=1).at[500].set(False)
+    yield figure("lanes beside a failed one that changed", "1000 discs", jnp.sum(changed), 0)
     yield figure("code of a lane that is no number", "disc", int(bad[2][500]), least=1)
     try:
         jax.block_until_ready(jax.jit(lambda: jax.vmap(DISCS["values"][1])(jnp.zeros(2_000_000_000)))())
@@ -237,7 +213,7 @@ def failures(quick: bool) -> Figures:
     yield figure("numbers that changed after that", "1000 discs", jnp.sum(run(x)[0] != good[0]), 0)
 
 
-def interrupted(quick: bool) -> Figures:
+def interrupted(quick):
     """Ctrl-C while the device works; then all goes on."""
     x = jnp.linspace(-6.0, -3.0, 3_000_000)
     run = jax.jit(jax.vmap(DISCS["values"][1]))
@@ -253,7 +229,7 @@ def interrupted(quick: bool) -> Figures:
     yield figure("numbers that changed after that", "3e6 discs", jnp.sum(run(x)[0] != good[0]), 0)
 
 
-def twin(of: str, name: str, quick: bool) -> Figures:
+def twin(of, name, quick):
     """What needs no GPU: threads of one on the CPU, and text for its driver."""
     import gpu_twin
 
@@ -263,16 +239,15 @@ def twin(of: str, name: str, quick: bool) -> Figures:
     for order in ("in order", "reversed", "at once"):
         with gpu_twin.in_place_of_a_gpu(order, memory=2**20) as texts:
             differ = sum(not np.array_equal(*x) for x in zip(run(), expected, strict=True))
-        yield figure(
-            f"arrays that differ, threads of a GPU on the CPU {order}, {name}", f"7 lanes, {of}", differ, 0
-        )
+        what = f"arrays that differ, threads of a GPU on the CPU {order}, {name}"
+        yield figure(what, f"7 lanes, {of}", differ, 0)
     for architecture in ("sm_75", "sm_80", "sm_90", "sm_100"):
         every = [nvidia.text_for(text, architecture) for text in texts]
         missing = sum(len(re.findall(r"^\.extern", ptx, re.M)) for ptx in every)
         yield figure(f"undefined functions for {architecture}, {name}", of, missing, 0)
 
 
-def resources(of: str, name: str, quick: bool) -> Figures:
+def resources(of, name, quick):
     """Registers, stack and spills of the kernels of a model, by `ptxas` for compute capability 9.0; kernels
     of an earlier part in the same process are left out.
     """
@@ -287,61 +262,50 @@ def resources(of: str, name: str, quick: bool) -> Figures:
     yield figure(f"{', '.join(ASSEMBLED)} for sm_90, {name}", of, ", ".join(map(str, found)))
 
 
-def device(quick: bool) -> Figures:
+def device(quick):
     """The GPU."""
     yield figure("device", f"jax {jax.__version__}", str(jax.devices()[0].device_kind))
 
 
-def without_gpu() -> tuple[dict, list[str]]:
+def without_gpu():
     """Parts, and those of `--quick`."""
     if reason := host.reason_against() or nvidia.reason_against_text():
         print(f"no text for GPUs is made: {reason}")
         return {}, []
     import gpu_twin
 
-    parts = {
-        f"on the CPU, {of}, {name}": partial(twin, of, name)
-        for of in (*KINDS, *FOUR, *OTHERS)
-        for name in KINDS.get(of, FORMS)
-    }
+    pairs = [(of, name) for of in (*KINDS, *FOUR, *OTHERS) for name in (*KINDS.get(of, FORMS), SECOND)]
+    parts = {f"on the CPU, {of}, {name}": partial(twin, of, name) for of, name in pairs if name != SECOND}
     if gpu_twin.assembler():
-        parts |= {
-            f"assembler, {of}, {name}": partial(resources, of, name)
-            for of in (*KINDS, *FOUR, *OTHERS)
-            for name in (*KINDS.get(of, FORMS), SECOND)
-        }
+        parts |= {f"assembler, {of}, {name}": partial(resources, of, name) for of, name in pairs}
     parts["on the CPU, study"] = partial(study, 20_000, None)  # the calls alone: the figure is one of the CPU
-    quick = [f"on the CPU, disc, {name}" for name in ("values", "gradient")] + ["on the CPU, study"]
-    return parts, [*quick, *(f"on the CPU, {of}, values" for of in (*FOUR, "bicycle"))]
+    quick = ("disc, values", "disc, gradient", "study", *(f"{of}, values" for of in (*FOUR, "bicycle")))
+    return parts, [f"on the CPU, {name}" for name in quick]
 
 
-def with_gpu() -> tuple[dict, list[str]]:
+def with_gpu():
     """Parts, and those of `--quick`."""
     parts = {"device": device}
     parts |= {f"bits, {of}, {name}": partial(bits, of, name) for of in KINDS for name in FORMS}
-    parts |= {
-        "one disc, values": partial(alone, "disc", "values", -4.0, 1.0, 3.0),
-        "one disc, gradient": partial(alone, "disc", "gradient", -4.0, 3.0, None),
-    }
+    parts["one disc, values"] = partial(alone, "disc", "values", -4.0, 1.0, 3.0)
+    parts["one disc, gradient"] = partial(alone, "disc", "gradient", -4.0, 3.0, None)
     parts |= {f"speed, disc, {lanes:g}": partial(speed, "disc", "values", lanes) for lanes in (10**6, 10**7)}
     parts |= {f"speed, disc, {name}": partial(speed, "disc", name, 10**6) for name in list(DISCS)[1:]}
-    parts |= {"failures": failures, "interrupted": interrupted} | {
-        f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES
-    }
+    parts |= {"failures": failures, "interrupted": interrupted}
+    parts |= {f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES}
     parts["study"] = partial(study, 10**7, 2e7)
     parts["one bicycle, values"] = partial(alone, "bicycle", "values", 0.3, None, 8.0)
     others = {f"bits, {of}, {name}": partial(bits, of, name) for of in (*FOUR, *OTHERS) for name in FORMS}
-    late = ("bits, bicycle, tangent", "bits, bicycle, gradient")
-    return parts | others, [
-        *(name for name in parts if name not in late),
-        *(name for name in others if any(of in name for of in FOUR)),
-    ]
+    quick = parts.keys() - {"bits, bicycle, tangent", "bits, bicycle, gradient"}
+    quick |= {name for name in others if any(of in name for of in FOUR)}
+    parts |= others
+    return parts, [name for name in parts if name in quick]
 
 
-def in_time(name: str, part: Callable, until: float) -> Callable:
+def in_time(name, part, until):
     """Return a part that does not begin after a time."""
 
-    def run(quick: bool) -> Figures:
+    def run(quick):
         if time.monotonic() > until:
             yield figure("left out: no time was left", name, 1)
         else:
@@ -357,6 +321,5 @@ if __name__ == "__main__":
     reason = ffi.reason_against() if jax.default_backend() == "gpu" else "JAX's default backend is no GPU"
     if reason:
         print(f"no GPU: {reason}")
-    sys.path.insert(0, str(HERE.parent / "tests"))
     parts, quick = without_gpu() if reason else with_gpu()
     main(__doc__, {name: in_time(name, part, last) for name, part in parts.items()}, quick=quick)

@@ -11,7 +11,7 @@ import time
 
 import matplotlib as mpl
 import numpy as np
-from figures import HERE, Figures, figure, fresh, seconds_of
+from figures import HERE, figure, fresh, seconds_of
 
 import jourdain_jax as jj
 from jourdain_jax.identification import Fit, unbounded
@@ -52,43 +52,25 @@ FREE = dict.fromkeys(("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c"
 }
 
 
+SIGMA = {"lean_rate": 0.03, "steer_rate": 0.1}  # rad/s
+# of the start: the column of the data, and the scale of its uncertainty
+UNKNOWN = {"lean": ("lean_angle", 0.1), "lean_rate": ("lean_rate", 0.3)}
+UNKNOWN |= {"steer": ("fork_angle", 0.1), "steer_rate": ("fork_rate", 0.5)}
+
+
 def experiments() -> list[jj.Experiment]:
     """The 57 windows: lean rate and steer rate, the command as input, and an unknown start each."""
     with gzip.open(NOTEBOOKS / "data" / "steer_by_wire" / "windows.csv.gz", "rt") as file:
         rows = list(csv.DictReader(file))
-    runs, ts, scale = (
-        [],
-        0.01 * np.arange(100),
-        {"lean": 0.1, "lean_rate": 0.3, "steer": 0.1, "steer_rate": 0.5},
-    )
+    runs, ts = [], 0.01 * np.arange(100)
     for k in range(0, len(rows), 100):
-        column = {
-            name: np.array([float(row[name]) for row in rows[k : k + 100]])
-            for name in rows[0]
-            if name != "log"
-        }
-        first = {
-            "lean": "lean_angle",
-            "lean_rate": "lean_rate",
-            "steer": "fork_angle",
-            "steer_rate": "fork_rate",
-        }
-        start = {name: column[source][0] for name, source in first.items()} | {
-            "rear_spin_rate": column["speed"].mean() / NOMINAL["rR"]
-        }
+        column = {name: np.array([float(row[name]) for row in rows[k : k + 100]]) for name in rows[0]}
+        start = {name: column[source][0] for name, (source, _) in UNKNOWN.items()}
+        start["rear_spin_rate"] = column["speed"].mean() / NOMINAL["rR"]
         values = {"lean_rate": column["lean_rate"], "steer_rate": column["fork_rate"]}
-        unknown = {name: unbounded(s) for name, s in scale.items()}
-        torque = jj.Sampled(ts, column["command_fork"])
-        runs.append(
-            jj.Experiment(
-                ts,
-                values,
-                {"lean_rate": 0.03, "steer_rate": 0.1},
-                start=start,
-                unknown_start=unknown,
-                inputs={"steer_torque": torque},
-            )
-        )
+        how = {"unknown_start": {name: unbounded(scale) for name, (_, scale) in UNKNOWN.items()}}
+        how["inputs"] = {"steer_torque": jj.Sampled(ts, column["command_fork"])}
+        runs.append(jj.Experiment(ts, values, SIGMA, start=start, **how))
     return runs
 
 
@@ -97,7 +79,7 @@ def fitted(runs: list[jj.Experiment], **options) -> Fit:
     return jj.fit(SteerByWire(**NOMINAL), runs, FREE, rtol=1e-6, atol=1e-6, **options)
 
 
-def time_of_a_step(count: int) -> float:
+def time_of_a_step(count):
     """Processor time of a warm fit of the first runs for each step that it tries, s; fits of other runs try
     other numbers of steps.
     """
@@ -107,29 +89,21 @@ def time_of_a_step(count: int) -> float:
     return seconds / int(found.steps)
 
 
-def told() -> dict[str, float]:
+def told():
     """The numbers of `windows`, for a process of its own; 3 s to import all are counted in."""
     runs = experiments()
     found, cold = seconds_of(lambda: fitted(runs), time.perf_counter)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     again, warm = seconds_of(lambda: fitted(runs), time.perf_counter)
-    print(
-        "\n".join(
-            line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()
-        )
-    )
+    for line in str(found).split("\n"):
+        if "run " not in line and not line.strip()[:2].isdigit():
+            print(line)
     ratio = time_of_a_step(32) / time_of_a_step(8)
-    return {
-        "cold": cold + 3.0,
-        "warm": warm,
-        "memory": memory,
-        "steps": int(found.steps),
-        "converged": float(again.converged),
-        "ratio": ratio,
-    }
+    told = {"cold": cold + 3.0, "warm": warm, "memory": memory, "ratio": ratio}
+    return told | {"steps": int(found.steps), "converged": float(again.converged)}
 
 
-def windows(quick: bool) -> Figures:
+def windows(quick):
     """57 runs with 9 + 228 unknowns, in a fresh process."""
     found = fresh("import identification_logs, json; print(json.dumps(identification_logs.told()))")
     yield figure("57 windows, cold, s", MODEL, found["cold"], 60)
@@ -140,7 +114,7 @@ def windows(quick: bool) -> Figures:
     yield figure("a step at 32 runs over one at 8", MODEL, found["ratio"], 4.5)
 
 
-def logs(quick: bool) -> Figures:
+def logs(quick):
     """Odd and even windows, each half by itself, as the notebook on them has it: how far apart, how well each
     predicts the other, whether bodies can be.
     """
@@ -149,28 +123,21 @@ def logs(quick: bool) -> Figures:
         begin = time.process_time()
         told = runpy.run_path("06_steer_by_wire.py")
     halves, rms, out = told["halves"].values(), told["rms"], told["out"].values()
-    yield figure(
-        "lean-rate rms on held-out windows, rad/s", MODEL, max(rms(left["lean_rate"]) for left in out), 0.027
-    )
-    yield figure(
-        "steer-rate rms on held-out windows, rad/s", MODEL, max(rms(left["steer_rate"]) for left in out)
-    )
+    for rate, most in (("lean", 0.027), ("steer", None)):
+        worst = max(rms(left[f"{rate}_rate"]) for left in out)
+        yield figure(f"{rate}-rate rms on held-out windows, rad/s", MODEL, worst, most)
     yield figure("lean-rate rms by the authors' numbers, rad/s", MODEL, rms(told["plain"]["lean_rate"]))
-    yield figure(
-        "bodies that cannot be, of both halves", MODEL, sum(len(half.impossible) for half in halves), 0
-    )
-    yield figure(
-        "halves differ by, standard errors (from how runs differ)", MODEL, max(told["apart"].values()), 3
-    )
+    impossible = sum(len(half.impossible) for half in halves)
+    yield figure("bodies that cannot be, of both halves", MODEL, impossible, 0)
+    what = "halves differ by, standard errors (from how runs differ)"
+    yield figure(what, MODEL, max(told["apart"].values()), 3)
     for rate in ("lean", "steer"):
         correlation = max(told["neighbours"](left[f"{rate}_rate"]) for left in out)
         yield figure(f"correlation of neighbouring residuals of {rate} rate", MODEL, correlation)
     yield figure("halves converged, of two", MODEL, sum(bool(half.converged) for half in halves), least=2)
     yield figure("steps, the most of both", MODEL, max(int(half.steps) for half in halves), 50)
-    yield figure(
-        "frequency of weave from 3 m/s on, off that of damped exponentials, rad/s",
-        MODEL,
-        told["from_3"][:, 0].max(),
-    )
-    yield figure("the same by the authors' numbers, the least", MODEL, told["from_3"][:, 1].min())
+    what = "frequency of weave from 3 m/s on, off that of damped exponentials, rad/s"
+    ours, theirs = told["from_3"][:, :2].T
+    yield figure(what, MODEL, ours.max())
+    yield figure("the same by the authors' numbers, the least", MODEL, theirs.min())
     yield figure("processor time of the notebook, s", MODEL, time.process_time() - begin)

@@ -2,6 +2,8 @@
 contacts by Hertz and by any exponent.
 """
 
+from itertools import pairwise
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +21,8 @@ class Car(jj.Scene):
     coordinates = jj.coordinates("x y heading")
 
     def bodies(self, t, q):
-        return {
-            "car": jj.RigidBody.box(
-                self.mass,
-                (3.6, 1.5, 1.0),
-                position=jnp.stack([q.x, q.y, 0 * q.x]),
-                orientation=jj.rot_z(q.heading),
-            )
-        }
+        at = {"position": [q.x, q.y, 0.0], "orientation": jj.rot_z(q.heading)}
+        return {"car": jj.RigidBody.box(self.mass, (3.6, 1.5, 1.0), **at)}
 
     def loads(self, motion):
         u, c, s = motion.u, jnp.cos(motion.q.heading), jnp.sin(motion.q.heading)
@@ -37,12 +33,8 @@ class Car(jj.Scene):
             return -5400.0 * jnp.sin(1.4 * jnp.arctan(x - 0.3 * (x - jnp.arctan(x))))
 
         front, rear = axle(1.2, self.steer), axle(-1.4, 0.0)
-        total = front + rear
-        return (
-            jj.generalized_force(
-                motion, x_rate=-s * total, y_rate=c * total, heading_rate=1.2 * front - 1.4 * rear
-            ),
-        )
+        total, turn = front + rear, 1.2 * front - 1.4 * rear
+        return jj.generalized_force(motion, x_rate=-s * total, y_rate=c * total, heading_rate=turn)
 
 
 class Blocks(jj.Scene):
@@ -53,20 +45,14 @@ class Blocks(jj.Scene):
     coordinates = jj.coordinates("x y")
 
     def bodies(self, t, q):
-        return {
-            name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x]))
-            for name, x in (("first", q.x), ("second", q.y))
-        }
+        return {name: jj.Particle(1.0, [q[name], 0.0, 0.0]) for name in "xy"}
 
     def loads(self, motion):
         q, u, k = motion.q, motion.u, self.stiffness
         rough = lambda v: -self.friction * 9.81 * jnp.tanh(v / 0.05)
         spring = k * (q.y - q.x)
-        return (
-            jj.generalized_force(
-                motion, x_rate=rough(u.x_rate) - k * q.x + spring, y_rate=rough(u.y_rate) - spring
-            ),
-        )
+        first, second = rough(u.x_rate) - k * q.x + spring, rough(u.y_rate) - spring
+        return jj.generalized_force(motion, x_rate=first, y_rate=second)
 
 
 class Beads(jj.Scene):
@@ -78,32 +64,23 @@ class Beads(jj.Scene):
     coordinates = jj.coordinates("x y z")
 
     def bodies(self, t, q):
-        return {
-            name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x]))
-            for name, x in zip("abc", (q.x, q.y, q.z), strict=True)
-        }
+        return {name: jj.Particle(1.0, [q[name], 0.0, 0.0]) for name in "xyz"}
 
     def loads(self, motion):
         q, exponent = motion.q, 1.5 if self.by_hertz else self.exponent
         push = [self.stiffness * jnp.maximum(d, 0.0) ** exponent for d in (-q.x, q.x - q.y, q.y - q.z, q.z)]
-        return (
-            jj.generalized_force(
-                motion, x_rate=push[0] - push[1], y_rate=push[1] - push[2], z_rate=push[2] - push[3]
-            ),
-        )
+        x, y, z = (before - after for before, after in pairwise(push))
+        return jj.generalized_force(motion, x_rate=x, y_rate=y, z_rate=z)
 
 
-def cases(lanes: int) -> dict[str, tuple[jj.Scene, dict[str, np.ndarray], float]]:
+def cases(lanes):
     """Name -> scene, spread starts and span."""
     random = np.random.default_rng(0)
     normal = lambda size: size * random.normal(size=lanes)
     shoved = {"x_rate": 1 + random.random(lanes), "y": 0.01 * random.random(lanes)}
+    driven = {"x_rate": 15 + 5 * random.random(lanes), "y_rate": normal(0.5), "heading_rate": normal(0.3)}
     return {
-        "car with tyres": (
-            Car(),
-            {"x_rate": 15 + 5 * random.random(lanes), "y_rate": normal(0.5), "heading_rate": normal(0.3)},
-            3.0,
-        ),
+        "car with tyres": (Car(), driven, 3.0),
         "blocks with friction": (Blocks(), {"x": normal(1.0), "y": normal(1.0), "x_rate": normal(1.0)}, 3.0),
         "beads, Hertz": (Beads(), shoved, 1.0),
         "beads, an exponent that is a parameter": (Beads(by_hertz=False), shoved, 1.0),

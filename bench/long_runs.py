@@ -10,15 +10,13 @@ and draws `long_runs.png`: the largest error so far against time. `--quick`: 2,0
 under two minutes.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from figures import HERE, Figures, figure, main, seconds_of
+from figures import HERE, figure, main, markdown, seconds_of
 from long_runs_scenes import ChaoticOscillator, ContactOscillator, GaugeTwin, Transmission
 
 import jourdain_jax as jj
@@ -30,6 +28,9 @@ METHODS = {
     "discrete gradient": jj.DiscreteGradient,
 }
 EXPLICIT = {"Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()}
+COLOURS = ("#0072b2", "#d55e00", "#e69f00", "#009e73", "#999999", "#000000")
+COLOURS = dict(zip((*METHODS, *EXPLICIT), COLOURS, strict=True))
+ERRORS = ("energy", "integral")
 DLA = ("DLA, midpoint", "DLA, trapezoidal")
 SAVED = 1000  # times, besides the start
 TOLERANCES = [10.0**-k for k in range(3, 14)]
@@ -51,9 +52,8 @@ class Problem:
 
 PROBLEMS = (
     Problem("contact oscillator", ContactOscillator(), 0.2, "driver"),
-    Problem(
-        "its gauge twin", GaugeTwin(), 0.2, "driver", DLA, ()
-    ),  # for the others it is the contact oscillator
+    # for the others it is the contact oscillator
+    Problem("its gauge twin", GaugeTwin(), 0.2, "driver", DLA, ()),
     Problem("transmission", Transmission(), 0.2, "driver"),
     Problem("Chaplygin sleigh", jj.models.ChaplyginSleigh(), 0.1, "heading and slide"),
     Problem("chaotic oscillator", ChaoticOscillator(), 0.2, None),
@@ -74,41 +74,35 @@ class Run:
     method: str
     how: str  # step or tolerance
     motion: jj.Trajectory
-    errors: dict[str, np.ndarray]
+    errors: dict
     seconds: float  # of processor time
 
     @property
-    def ended(self) -> str:
+    def ended(self):
         """Where it failed, how it ended."""
         return "" if self.motion.message == "reached the end of its span" else f"; {self.motion.message}"
 
-    def extremes(self, of: str) -> tuple[float, ...]:
+    def extremes(self, of):
         """The largest error over all, the first tenth and the last tenth of a run."""
         error = self.errors[of]
         tenth = len(error) // 10
         return float(error.max()), float(error[: tenth + 1].max()), float(error[-tenth:].max())
 
 
-def timed(run: Callable) -> tuple[jj.Trajectory, float]:
+def timed(run):
     """A motion and the processor time it took, without compilation: the less of two runs."""
     run()
     (motion, first), (_, second) = seconds_of(run), seconds_of(run)
     return motion, min(first, second)
 
 
-def errors(values) -> np.ndarray:
+def errors(values):
     """Change since the start."""
     values = np.asarray(values)
     return np.abs(values - values[0])
 
 
-def extremes(error: np.ndarray) -> tuple[float, float, float]:
-    """The largest error over all, the first tenth and the last tenth of a run."""
-    tenth = len(error) // 10
-    return float(error.max()), float(error[: tenth + 1].max()), float(error[-tenth:].max())
-
-
-def tolerance_for(run: Callable, seconds: float) -> float:
+def tolerance_for(run, seconds):
     """The tightest tolerance that costs no more than `seconds`; the loosest where none does."""
     for tolerance in reversed(TOLERANCES):
         if timed(partial(run, tolerance))[1] <= seconds:
@@ -116,7 +110,7 @@ def tolerance_for(run: Callable, seconds: float) -> float:
     return TOLERANCES[0]
 
 
-def outcome(problem: Problem, method: str, how: str, call: Callable) -> Run:
+def outcome(problem, method, how, call) -> Run:
     """A run, timed, and its errors."""
     motion, seconds = timed(call)
     balance = np.asarray(motion.energies().balance)
@@ -125,7 +119,7 @@ def outcome(problem: Problem, method: str, how: str, call: Callable) -> Run:
     return Run(method, how, motion, found, seconds)
 
 
-def _integral_of(motion: jj.Trajectory, name: str) -> np.ndarray:
+def _integral_of(motion: jj.Trajectory, name):
     """The integral against time; that of the sleigh in a form that has no jump where its turn rate has died
     away to round-off of either sign.
     """
@@ -137,96 +131,73 @@ def _integral_of(motion: jj.Trajectory, name: str) -> np.ndarray:
     return float(sleigh.offset) * heading - k * np.arctan2(forward, k * np.asarray(motion["heading_rate"]))
 
 
-def runs(problem: Problem, steps: int) -> Iterator[Run]:
+def runs(problem, steps):
     """All runs of a problem."""
     scene, span, allowed = problem.scene, problem.step * steps, 0.0
     start = jj.start(scene, **scene.example)
 
     def with_tolerance(solver, ts, tolerance):
-        tolerance = jnp.asarray(tolerance)
-        return jj.simulate(
-            scene, start, ts=ts, rtol=tolerance, atol=tolerance, solver=solver, max_steps=100 * steps
-        )
+        how = {"rtol": jnp.asarray(tolerance), "atol": jnp.asarray(tolerance), "max_steps": 100 * steps}
+        return jj.simulate(scene, start, ts=ts, solver=solver, **how)
 
     ts = jnp.linspace(0.0, span, min(SAVED, steps // 20) + 1)
     for name in problem.methods:
-        call = partial(
-            jj.simulate, scene, start, ts=ts, solver=METHODS[name](step=problem.step), max_steps=2 * steps
-        )
+        solver = METHODS[name](step=problem.step)
+        call = partial(jj.simulate, scene, start, ts=ts, solver=solver, max_steps=2 * steps)
         found = outcome(problem, name, f"h = {problem.step:g} s", call)
         allowed = allowed or found.seconds / 20  # of the implicit midpoint rule, which comes first
         yield found
     for name in problem.explicit:
         # one saved time only: the steps between saved times are to be the method's own
-        tolerance = tolerance_for(partial(with_tolerance, EXPLICIT[name], jnp.array([span / 20])), allowed)
-        yield outcome(
-            problem, name, f"{tolerance:.0e}", partial(with_tolerance, EXPLICIT[name], ts, tolerance)
-        )
+        run = partial(with_tolerance, EXPLICIT[name])
+        tolerance = tolerance_for(partial(run, jnp.array([span / 20])), allowed)
+        yield outcome(problem, name, f"{tolerance:.0e}", partial(run, ts, tolerance))
 
 
-def table(found: dict[Problem, list[Run]]) -> str:
+def table(found):
     """The table of the documentation, in Markdown."""
-    lines = [
-        "| scene | solver | h or tolerance | s | energy, relative | integral |",
-        "|---|---|---|---|---|---|",
-    ]
+    head = ("scene", "solver", "h or tolerance", "s", "energy, relative", "integral")
+    rows, shown = [], "{:.0e} ({:.0e}, {:.0e})"
     for problem, each in found.items():
         for run in each:
-            shown = [
-                "{:.0e} ({:.0e}, {:.0e})".format(*run.extremes(of)) if of in run.errors else ""
-                for of in ("energy", "integral")
-            ]
-            lines.append(
-                f"| {problem.name} | {run.method} | {run.how} | {run.seconds:.2g} | {shown[0]}{run.ended} |"
-                f" {shown[1]} |"
-            )
-    return "\n".join(lines) + "\n"
+            energy, integral = (shown.format(*run.extremes(of)) if of in run.errors else "" for of in ERRORS)
+            how = (problem.name, run.method, run.how, f"{run.seconds:.2g}")
+            rows.append((*how, energy + run.ended, integral))
+    return "\n".join(markdown(head, rows)) + "\n"
 
 
-def draw(found: dict[Problem, list[Run]], path: Path) -> None:
+def draw(found, path):
     """Largest error so far against time: a row per problem, energy and integral side by side."""
     import matplotlib.pyplot as plt
 
-    colours = dict(
-        zip(
-            (*METHODS, *EXPLICIT),
-            ("#0072b2", "#d55e00", "#e69f00", "#009e73", "#999999", "#000000"),
-            strict=True,
-        )
-    )
-    looks = {
-        name: {"color": colour, "ls": "--" if name in EXPLICIT else "-", "lw": 1.6}
-        for name, colour in colours.items()
-    }
-    figure, axes = plt.subplots(
-        len(found), 2, figsize=(10, 2.5 * len(found) + 0.7), squeeze=False, sharex="all"
-    )
+    looks = {}
+    for name, colour in COLOURS.items():
+        explicit = name in EXPLICIT
+        label = name + ", at most the cost of midpoint" * explicit
+        looks[name] = {"color": colour, "ls": "--" if explicit else "-", "lw": 1.6, "label": label}
+    size = (10, 2.5 * len(found) + 0.7)
+    figure, axes = plt.subplots(len(found), 2, figsize=size, squeeze=False, layout="constrained")
     for (problem, each), pair in zip(found.items(), axes, strict=True):
-        for axis, of in zip(pair, ("energy", "integral"), strict=True):
+        for axis, of in zip(pair, ERRORS, strict=True):
             for run in each:
                 if of in run.errors:
                     worst = np.maximum(np.maximum.accumulate(run.errors[of][1:]), 1e-17)
                     axis.loglog(run.motion.ts[1:], worst, **looks[run.method])
             axis.grid(alpha=0.3)
-            axis.set(
-                xlabel="t (s)",
-                ylim=(1e-17, 10),
-                ylabel="error" if of == "integral" else f"{problem.name}\nrelative error",
-            )
-            axis.set_title(of if of == "energy" else f"integral: {problem.integral}", fontsize=10)
-            axis.tick_params(labelbottom=True)
+            axis.set(xlabel="t (s)", ylim=(1e-17, 10), ylabel="error")
+        pair[0].set_ylabel(f"{problem.name}\nrelative error")
+        pair[0].set_title("energy", fontsize=10)
+        pair[1].set_title(f"integral: {problem.integral}", fontsize=10)
         if problem.integral is None:
             pair[1].set_axis_off()
     handles = [plt.Line2D([], [], **look) for look in looks.values()]
-    labels = [name if name in METHODS else f"{name}, at most the cost of midpoint" for name in colours]
-    figure.legend(handles, labels, loc="upper center", ncol=3, frameon=False)
-    figure.tight_layout(rect=(0, 0, 1, 1 - 0.75 / figure.get_figheight()))
+    figure.legend(handles=handles, loc="outside upper center", ncol=3, frameon=False)
     figure.savefig(path, dpi=130)
 
 
-def long_runs(quick: bool, out: Path) -> Figures:
+def long_runs(quick, out):
     """Errors and seconds of every run; the table and the picture."""
-    found: dict[Problem, list[Run]] = {}
+    found = {}
     for problem in QUICK if quick else PROBLEMS:
         found[problem] = []
         for run in runs(problem, 2_000 if quick else 100_000):

@@ -2,8 +2,6 @@
 program integrates.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from baselines.heyoka_lowered import names
@@ -17,7 +15,7 @@ def starts_at(scene: jj.Scene, y) -> jj.State:
     return jax.jit(jax.vmap(lambda y: jj.start(scene, dict(zip(known, y, strict=True)))))(jnp.asarray(y))
 
 
-def final_states(scene: jj.Scene, end: float, alone: bool = False, **options) -> Callable:
+def final_states(scene: jj.Scene, end, alone=False, **options):
     """Return a compiled function of a tolerance and starts; `alone`: one motion after another inside one
     compiled program, not a batch.
     """

@@ -9,9 +9,8 @@ Writes a list of {"figure", "model", "value", "required", "met"}; `required` is 
 told. Times of warm motions are processor time, the least of some repeats, the two ways in turn.
 """
 
-import itertools
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from functools import partial
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
@@ -24,8 +23,9 @@ import jax.numpy as jnp
 import laws_of_force
 import numpy as np
 from baselines import disc_run, heyoka_lowered
-from figures import Figures, figure, fresh, least_processor_time, main, seconds_of
+from figures import figure, fresh, least_processor_time, main, seconds_of
 from minimal_states import starts_at
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax.integrate.vector_fields.field import ByProgram
@@ -43,9 +43,7 @@ MOTIONS = (
 )
 
 
-def compared(
-    what: str, model: str, call: Callable, count: int, required: float | None, repeats: int
-) -> Generator[dict, None, dict]:
+def compared(what, model, call, count, required, repeats) -> Generator:
     """Both ways of a call, which takes a backend and returns arrays: the first time, warm, one over the
     other, and how far apart; returns what they give.
     """
@@ -62,23 +60,19 @@ def compared(
     return found
 
 
-def spread_starts(scene: jj.Scene, lanes: int) -> jj.State:
+def spread_starts(scene: jj.Scene, lanes) -> jj.State:
     """Admissible starts near the scene's example: the disc's as in `disc_run`, of others each named number by
     5 %.
     """
     if isinstance(scene, jj.models.TiltingDisc):
         return starts_at(scene, disc_run.starts(lanes))
     random = np.random.default_rng(0)
-    values = {
-        name: np.asarray(x) * (1 + 0.05 * random.normal(size=(lanes, *np.shape(x))))
-        for name, x in scene.example.items()
-    }
-    return jax.vmap(lambda values: jj.start(scene, **values))(
-        {name: jnp.asarray(x) for name, x in values.items()}
-    )
+    changed = lambda x: jnp.asarray(x) * (1 + 0.05 * random.normal(size=(lanes, *np.shape(x))))
+    values = {name: changed(x) for name, x in scene.example.items()}
+    return jax.vmap(lambda values: jj.start(scene, values))(values)
 
 
-def batches(quick: bool) -> Figures:
+def batches(quick):
     """A thousand spread starts, and one alone, at three tolerances."""
     lanes = FEW if quick else LANES
     for name, span, more in MOTIONS[: 1 if quick else None]:
@@ -89,14 +83,8 @@ def batches(quick: bool) -> Figures:
 
             @partial(jax.jit, static_argnums=0)
             def run(backend, tolerance, starts, scene=scene, span=span, more=more, alone=alone):
-                options = {
-                    "ts": jnp.array([span]),
-                    "solver": diffrax.Dopri8(),
-                    "rtol": tolerance,
-                    "atol": tolerance,
-                    "backend": backend,
-                    **more,
-                }
+                options = {"ts": jnp.array([span]), "solver": diffrax.Dopri8(), "backend": backend} | more
+                options |= {"rtol": tolerance, "atol": tolerance}
                 if alone:
                     motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
                 else:
@@ -107,14 +95,13 @@ def batches(quick: bool) -> Figures:
                 what = f"{who if more else f'{who}, default options'}, {tolerance:.0e}"
                 required = 0.5 if not alone and name == "tilting-disc" else 1.0
                 call = lambda backend, run=run, given=(tolerance, starts): partial(run, backend, *given)
-                found = yield from compared(
-                    what, name, call, 1 if alone else lanes, required, 3 if quick else 7
-                )
+                count, repeats = 1 if alone else lanes, 3 if quick else 7
+                found = yield from compared(what, name, call, count, required, repeats)
                 for way in WAYS:
                     yield figure(f"{what}, tried steps, {way}", name, np.mean(found[way][1]))
 
 
-def heyoka(quick: bool) -> Figures:
+def heyoka(quick):
     """A thousand spread starts, and motions alone, at equal final error."""
     if heyoka_lowered.heyoka is None:
         print(heyoka_lowered.MISSING)
@@ -124,19 +111,14 @@ def heyoka(quick: bool) -> Figures:
         yield from against_heyoka.compared(name, starts, span, more, quick)
 
 
-def records(quick: bool) -> Figures:
+def records(quick):
     """2 s of a bicycle whose steer torque is a record of 201 samples, or a function of time, each lane its
     own; and derivatives for four parameters.
     """
-    scene, name, lanes, scale = (
-        jj.models.MODELS["whipple-bicycle"](),
-        "whipple-bicycle",
-        2 if quick else 8,
-        1e-8,
-    )
+    scene, name, lanes = jj.models.WhippleBicycle(), "whipple-bicycle", 2 if quick else 8
     start, times = jj.start(scene, rear_spin_rate=15.0, lean_rate=0.05), np.linspace(0.0, 2.0, 201)
     torques = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=(lanes, 201)))
-    parameters = jnp.stack([scene.mB, scene.IBxx, scene.zB, scene.mH])
+    parameters = {name: getattr(scene, name) for name in ("mB", "IBxx", "zB", "mH")}
 
     def wave(torque):
         size, phase = torque[:2]
@@ -145,30 +127,21 @@ def records(quick: bool) -> Figures:
     kinds = {"record": partial(jj.Sampled, times), "function of time": wave}
 
     def rates(backend, kind, parameters, torque):
-        own = scene.replace(**dict(zip(("mB", "IBxx", "zB", "mH"), parameters, strict=True)))
-        options = {
-            "ts": jnp.linspace(0.05, 2.0, 40),
-            "rtol": scale,
-            "atol": scale,
-            "events": False,
-            "backend": backend,
-        }
-        return jj.simulate(own, start, inputs={"steer_torque": kinds[kind](torque)}, **options).u
+        inputs = {"steer_torque": kinds[kind](torque)}
+        options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": 1e-8, "atol": 1e-8, "events": False}
+        return jj.simulate(scene.replace(**parameters), start, inputs=inputs, backend=backend, **options).u
 
     def call(backend, kind, function):
-        return partial(
-            jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0))), parameters, torques
-        )
+        run = jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0)))
+        return partial(run, parameters, torques)
 
-    for kind, (what, function) in itertools.product(
-        kinds, (("motion", lambda f: f), ("its derivatives", jax.jacfwd))
-    ):
-        yield from compared(
-            f"{kind}, {what}", name, partial(call, kind=kind, function=function), lanes, 0.5, 3
-        )
+    for kind in kinds:
+        for what, function in (("motion", lambda f: f), ("its derivatives", jax.jacfwd)):
+            asked = partial(call, kind=kind, function=function)
+            yield from compared(f"{kind}, {what}", name, asked, lanes, 0.5, 3)
 
 
-def times(quick: bool) -> Figures:
+def times(quick):
     """Derivatives of a motion with respect to a delay of its saved times, by both modes and both ways."""
     for name in ("tilting-disc",) if quick else ("tilting-disc", "whipple-bicycle"):
         scene = jj.models.MODELS[name]()
@@ -176,9 +149,8 @@ def times(quick: bool) -> Figures:
 
         def seen(delay, backend, scene=scene, start=start):
             ts = jnp.linspace(0.2, 1.0, 21) - delay
-            return jnp.sum(
-                jnp.sin(jj.simulate(scene, start, t0=0.0, ts=ts, t1=1.0, backend=backend, **BARE).q)
-            )
+            motion = jj.simulate(scene, start, t0=0.0, ts=ts, t1=1.0, backend=backend, **BARE)
+            return jnp.sum(jnp.sin(motion.q))
 
         for mode, differentiated in (("forward", jax.jacfwd), ("reverse", jax.grad)):
             what = f"slope with respect to a delay, {mode}"
@@ -186,26 +158,22 @@ def times(quick: bool) -> Figures:
                 jax.jit(slope(partial(seen, backend=backend))), 0.013
             )
             found = yield from compared(what, name, call, 1, None, 50)
-            yield figure(
-                f"{what}, relative difference",
-                name,
-                abs(float(found["native"]) / float(found["XLA"]) - 1.0),
-                1e-7,
-            )
+            off = abs(float(found["native"]) / float(found["XLA"]) - 1.0)
+            yield figure(f"{what}, relative difference", name, off, 1e-7)
 
 
-def watching(quick: bool) -> Figures:
+def watching(quick):
     """What it costs to judge, at every stage of every step, whether the privileged speeds still determine the
     others: motions with it over motions without.
     """
-    scene, name = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle"
-    speeds, watched = jnp.linspace(-16.0, -15.0, 256), ByProgram.has_pivots
+    scene, watched = jj.models.WhippleBicycle(), ByProgram.has_pivots
+    speeds = jnp.linspace(-16.0, -15.0, 256)
 
     def last(spin_rate):
         start = {"rear_spin_rate": spin_rate, "lean_rate": 0.1}
         return jj.simulate(scene, start, ts=jnp.array([2.0]), work=False, backend="native").q_end
 
-    def compiled(has_pivots) -> Callable:
+    def compiled(has_pivots):
         ByProgram.has_pivots = has_pivots
         try:
             run = jax.jit(jax.vmap(last))
@@ -216,70 +184,47 @@ def watching(quick: bool) -> Figures:
 
     runs = {"watched": compiled(watched), "not watched": compiled(property(lambda field: False))}
     seconds = least_processor_time(runs, 15 if quick else 60)
-    yield figure(
-        "motions whose pivots are watched over such whose are not",
-        name,
-        seconds["watched"] / seconds["not watched"],
-        1.05,
-    )
+    ratio = seconds["watched"] / seconds["not watched"]
+    yield figure("motions whose pivots are watched over such whose are not", "whipple-bicycle", ratio, 1.05)
 
 
-class Pushed(jj.Scene):
+class Pushed(OnPlane):
     """A mass that two inputs push, on springs."""
 
     stiffness: jax.Array = jj.parameter(4.0, unit="N/m")
-    coordinates = jj.coordinates("x y")
     inputs = jj.inputs("f g")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         f, g = motion.inputs.f - self.stiffness * motion.q.x, motion.inputs.g - self.stiffness * motion.q.y
-        return (jj.generalized_force(motion, x_rate=f, y_rate=g),)
+        return jj.generalized_force(motion, x_rate=f, y_rate=g)
 
 
-def calls(quick: bool) -> Figures:
+def calls(quick):
     """What `simulate` called from Python costs more than the same motion, of 1 s saved 201 times, from a
     given state under the user's `jit`.
     """
+    knots = np.linspace(0.0, 1.0, 11)
     two = {
         "two numbers": {"f": 1.0, "g": 0.5},
         "two functions of time": {"f": jnp.sin, "g": lambda t: jnp.cos(2 * t)},
-        "two records": {
-            name: jj.Sampled(np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11) ** power)
-            for name, power in (("f", 2), ("g", 3))
-        },
+        "two records": {"f": jj.Sampled(knots, knots**2), "g": jj.Sampled(knots, knots**3)},
     }
-    cases = [
-        ("tilting-disc", jj.models.TiltingDisc(), None, 0.3),
-        ("whipple-bicycle", jj.models.MODELS["whipple-bicycle"](), None, 0.3),
-    ]
+    cases = [(name, jj.models.MODELS[name](), None, 0.3) for name in ("tilting-disc", "whipple-bicycle")]
     cases += [(f"mass pushed by {what}", Pushed(), inputs, 0.5) for what, inputs in two.items()]
     for name, scene, inputs, required in cases[: 1 if quick else None]:
         values = dict(scene.example) or {"x": 0.1}
-        options = {"t1": 1.0, "inputs": inputs}
-        state, compiled = (
-            jj.start(scene, **values),
-            jax.jit(lambda state, scene=scene, options=options: jj.simulate(scene, state, **options)),
-        )
-        runs = {"jit": partial(compiled, state)}
-        runs |= {
-            way: partial(jj.simulate, scene, start, **options)
-            for way, start in (("a state", state), ("named values", values))
-        }
+        moved = partial(jj.simulate, scene, t1=1.0, inputs=inputs)
+        state, compiled = jj.start(scene, values), jax.jit(lambda state, moved=moved: moved(state))
+        ways = {"a state": partial(moved, state), "named values": partial(moved, values)}
+        runs = {"jit": partial(compiled, state)} | ways
         seconds = least_processor_time(runs, 50 if quick else 400)
         yield figure("a call under the user's jit, ms", name, 1e3 * seconds["jit"])
-        for way in ("a state", "named values"):
-            yield figure(
-                f"called from Python with {way}, ms more",
-                name,
-                1e3 * (seconds[way] - seconds["jit"]),
-                required,
-            )
+        for way in ways:
+            more = 1e3 * (seconds[way] - seconds["jit"])
+            yield figure(f"called from Python with {way}, ms more", name, more, required)
 
 
-def in_single(name: str, lanes: int) -> list[dict]:
+def in_single(name, lanes):
     """Motions of 2 s in single precision, alone and as a batch, for a process of its own."""
     scene, ts = jj.models.MODELS[name](), jnp.linspace(0.1, 2.0, 20)
     start, found = jj.start(scene), []
@@ -291,14 +236,12 @@ def in_single(name: str, lanes: int) -> list[dict]:
         end = lambda q: jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, q), **options).q_end
         return partial(jax.jit(end if qs.ndim == 1 else jax.vmap(end)), qs)
 
-    for who, qs, count in (("alone", near[0], 1), (f"batch of {lanes}", near, lanes)):
-        found += compared(
-            f"single precision, {who}", name, partial(call, qs=qs), count, 1.0, 20 if count == 1 else 3
-        )
+    for who, qs, count, repeats in (("alone", near[0], 1, 20), (f"batch of {lanes}", near, lanes, 3)):
+        found += compared(f"single precision, {who}", name, partial(call, qs=qs), count, 1.0, repeats)
     return found
 
 
-def single(quick: bool) -> Figures:
+def single(quick):
     """Motions in single precision, in processes of their own: machine code rounds what it is given and
     returns, XLA all that it computes.
     """
@@ -307,7 +250,7 @@ def single(quick: bool) -> Figures:
         yield from fresh(program, name, FEW if quick else LANES, JAX_ENABLE_X64="0")
 
 
-def laws(quick: bool) -> Figures:
+def laws(quick):
     """Batches of scenes whose forces are functions beyond sine and cosine, and their derivatives with respect
     to the start.
     """
@@ -315,15 +258,12 @@ def laws(quick: bool) -> Figures:
     for name, (scene, starts, span) in list(laws_of_force.cases(lanes).items())[: 1 if quick else None]:
 
         def end(start, backend, scene=scene, span=span):
-            return jj.simulate(
-                scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, backend=backend
-            ).q_end
+            options = {"ts": jnp.array([span]), "rtol": 1e-8, "atol": 1e-8, "backend": backend}
+            return jj.simulate(scene, start, **options).q_end
 
-        for what, count, of in (
-            ("motion", lanes, lambda f: f),
-            ("forward mode", 8, jax.jacfwd),
-            ("reverse mode", 8, jax.jacrev),
-        ):
+        ways = {"motion": lambda f: f, "forward mode": jax.jacfwd, "reverse mode": jax.jacrev}
+        for what, of in ways.items():
+            count = lanes if what == "motion" else 8
             given = {key: jnp.asarray(x[:count]) for key, x in starts.items()}
             call = lambda backend, of=of, end=end, given=given: partial(
                 jax.jit(jax.vmap(of(partial(end, backend=backend)))), given

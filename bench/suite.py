@@ -15,23 +15,22 @@ from contextlib import suppress
 from threading import Thread
 
 import psutil
-from figures import HERE, Figures, figure, main
+from figures import HERE, figure, main
 
 COMMAND = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile"]
 QUICK = ("tests/test_simulate.py", "tests/test_deep_programs.py", "tests/test_labelled.py")
 _TEST = re.compile(r"^\s*([\d.]+)s (call|setup|teardown)\s+(\S+)", re.MULTILINE)
 
 
-def suite(quick: bool) -> Figures:
+def suite(quick):
     """Run the command; yield its times in s, its peak in GiB, and the slowest files and tests."""
     command = [*COMMAND, "--durations=0", "--durations-min=0.05", *(QUICK if quick else ())]
     begin, peak, processor = time.perf_counter(), 0, Counter()
-    run = subprocess.Popen(
-        command, cwd=HERE.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    run = subprocess.Popen(command, cwd=HERE.parent, **pipes)
     tree = psutil.Process(run.pid)
     with run.stdout as stream:
-        lines: list[str] = []
+        lines = []
         reader = Thread(target=lambda: lines.extend(stream))
         reader.start()
         while run.poll() is None:
@@ -52,7 +51,7 @@ def suite(quick: bool) -> Figures:
         raise RuntimeError(text.strip().rpartition("\n")[2])
 
 
-def _resident(tree: psutil.Process, processor: Counter) -> int:
+def _resident(tree: psutil.Process, processor: Counter):
     """Return the sum of resident memory of a process and all below it, bytes; note the processor time of each
     so far.
     """

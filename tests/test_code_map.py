@@ -28,7 +28,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
     "code tokens of tests": 340_746,
-    "code tokens of bench": 108_346,
+    "code tokens of bench": 99_807,
     "test files that reach private names": 34,
 }
 

@@ -6,12 +6,11 @@ else is simplified.
 """
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 
 
-def _operator(name: str, swapped: bool = False) -> Callable:
+def _operator(name, swapped=False):
     def apply(*arguments):
         found = [
             x if isinstance(x, Scalar) else Scalar("number", (x,))
@@ -49,9 +48,7 @@ FUNCTIONS = SimpleNamespace(
 )
 
 
-def count_operations(
-    function: Callable, parameters: tuple[str, ...], coordinates: int, speeds: int
-) -> Counter[str]:
+def count_operations(function, parameters, coordinates, speeds) -> Counter[str]:
     """Operations of `function(parameters, t, q, v, xp)` by name; their number is `.total()`."""
     states = [Scalar("state", (i,)) for i in range(1 + coordinates + speeds)]
     known = {name: Scalar("parameter", (name,)) for name in parameters}

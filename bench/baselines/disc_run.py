@@ -6,8 +6,6 @@ differ from it by 5 % (standard deviation). States are minimal, y = (x, y, yaw, 
 lean_rate, spin_rate).
 """
 
-from collections.abc import Callable
-
 import jax
 import numpy as np
 
@@ -20,23 +18,20 @@ SCATTER = 0.05
 MINIMAL = np.array([0, 1, 2, 3, 4, 7, 8, 9])  # of the ten states (q, qdot)
 
 
-def starts(lanes: int) -> np.ndarray:
+def starts(lanes):
     """Initial minimal states, (lanes, 8)."""
     return START * (1 + SCATTER * np.random.default_rng(0).normal(size=(lanes, len(START))))
 
 
-def with_all_speeds(y: np.ndarray) -> np.ndarray:
+def with_all_speeds(y):
     """The states (q, qdot), (lanes, 10), of minimal ones: the contact point moves by `radius spin_rate` along
     the heading.
     """
-    forward = dense.DISC_PARAMETERS["radius"] * y[:, 7]
-    return np.concatenate(
-        [y[:, :5], (forward * np.cos(y[:, 2]))[:, None], (forward * np.sin(y[:, 2]))[:, None], y[:, 5:]],
-        axis=1,
-    )
+    forward, yaw = dense.DISC_PARAMETERS["radius"] * y[:, 7], y[:, 2]
+    return np.column_stack([y[:, :5], forward * np.cos(yaw), forward * np.sin(yaw), y[:, 5:]])
 
 
-def final_states(method: str) -> Callable[[float, np.ndarray], np.ndarray]:
+def final_states(method):
     """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by diffrax;
     `method`: "dense" or "flat".
     """
@@ -46,25 +41,22 @@ def final_states(method: str) -> Callable[[float, np.ndarray], np.ndarray]:
     def integrated(tolerance, y):
         return dense.integrate(rates, dense.DISC_PARAMETERS, y, END, "Dopri8", tolerance)
 
-    def run(tolerance, starts):
-        if method == "flat":
-            return np.asarray(integrated(tolerance, starts))
-        return np.asarray(integrated(tolerance, with_all_speeds(starts)))[:, MINIMAL]
-
-    return run
+    if method == "flat":
+        return lambda tolerance, starts: np.asarray(integrated(tolerance, starts))
+    return lambda tolerance, starts: np.asarray(integrated(tolerance, with_all_speeds(starts)))[:, MINIMAL]
 
 
-def reference(starts: np.ndarray) -> np.ndarray:
+def reference(starts):
     """Final minimal states, with a tolerance of 1e-14."""
     return final_states("flat")(1e-14, starts)
 
 
-def error(found: np.ndarray, expected: np.ndarray) -> float:
+def error(found, expected):
     """Largest error over all lanes and states, absolute in SI units."""
     return float(np.max(np.abs(found - expected)))
 
 
-def loosest(final: Callable[[float], np.ndarray], expected: np.ndarray, first: float) -> float:
+def loosest(final, expected, first):
     """The loosest tolerance whose final states have an error of 1e-8, on a grid of four per decade from
     `first` down; ValueError where none does.
     """

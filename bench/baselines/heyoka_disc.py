@@ -5,7 +5,7 @@ from .hand_derived import HAND_DERIVED, tilting_disc
 from .heyoka_lowered import MISSING, heyoka
 
 
-def system() -> list:
+def system():
     """The hand-derived equations as heyoka takes them."""
     if heyoka is None:
         raise ImportError(MISSING)

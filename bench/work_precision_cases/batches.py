@@ -2,8 +2,7 @@
 largest error over the first 100 lanes.
 """
 
-from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 
 import diffrax
 import jax
@@ -19,34 +18,27 @@ from work_precision_cases import record as records
 from work_precision_cases.curve import NotApplicable
 from work_precision_cases.measure import fastest
 from work_precision_cases.ours import MAX_STEPS
-from work_precision_cases.problem import Problem
 
 SIZES = (1, 100, 10_000)
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
 PROBLEMS = ("tilting-disc", "chaplygin-sleigh")
 JUDGED = 100  # lanes
-SCATTER, SEED = 0.05, 0
+SCATTER = 0.05
 SIMD = 8
 LONGEST = 60.0  # s: a method that would take longer than that for a batch is left out
 
 
-def starts(problem: Problem, lanes: int) -> np.ndarray:
+def starts(problem, lanes):
     """Minimal states (lanes, states), every number of the start changed by 5 % (standard deviation)."""
-    return (
-        problem.minimal_start
-        * (
-            1
-            + SCATTER
-            * np.random.default_rng(SEED).normal(size=(max(lanes, JUDGED), len(problem.minimal_start)))
-        )[:lanes]
-    )
+    start = problem.minimal_start
+    normal = np.random.default_rng(0).normal(size=(max(lanes, JUDGED), len(start)))
+    return start * (1 + SCATTER * normal[:lanes])
 
 
-def by_rollout(problem: Problem, solver=None) -> Callable:
+def by_rollout(problem, solver=None):
     """`rollout` under `jit`, by Dopri8 unless said; the consistent starts are given."""
-    run = final_states(
-        problem.scene, problem.end, solver=solver or diffrax.Dopri8(), events=False, max_steps=MAX_STEPS
-    )
+    options = {"solver": solver or diffrax.Dopri8(), "events": False, "max_steps": MAX_STEPS}
+    run = final_states(problem.scene, problem.end, **options)
 
     def prepared(y):
         starts = starts_at(problem.scene, y)
@@ -55,7 +47,7 @@ def by_rollout(problem: Problem, solver=None) -> Callable:
     return prepared
 
 
-def by_series(problem: Problem) -> Callable:
+def by_series(problem):
     """As `by_rollout`, by Taylor series of the order for each tolerance."""
     made = cache(lambda tolerance: by_rollout(problem, jj.Taylor(order_for(tolerance))))
 
@@ -66,41 +58,37 @@ def by_series(problem: Problem) -> Callable:
     return prepared
 
 
-def by_vmap(problem: Problem) -> Callable:
+def by_vmap(problem):
     """diffrax under `vmap` on the equations by hand."""
-    rates = peer_diffrax.rates_by_hand(problem)
-    one = lambda tolerance, y: peer_diffrax.final(rates, problem.end, diffrax.Dopri8(), tolerance, y)[0]
-    compiled = jax.jit(jax.vmap(one, in_axes=(None, 0)))
+    one = peer_diffrax.motion(problem)
+    return _of_starts(lambda tolerance, y: jax.vmap(lambda y: one(tolerance, y)[0])(y))
+
+
+def _of_starts(integrated):
+    compiled = jax.jit(integrated)
     return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
 
 
-def in_blocks(problem: Problem) -> Callable:
+def in_blocks(problem):
     """diffrax on the equations by hand, states as tuples of scalars, eight lanes side by side, one block of
     them after another.
     """
-    known = peer_diffrax.rates_by_hand(problem, stacked=False)
-    one = lambda tolerance, y: jnp.stack(
-        peer_diffrax.final(known, problem.end, diffrax.Dopri8(), tolerance, tuple(y))[0]
-    )
-    compiled = jax.jit(lambda tolerance, y: jax.lax.map(lambda y: one(tolerance, y), y, batch_size=SIMD))
-    return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
+    one = peer_diffrax.motion(problem, stacked=False)
+    end = lambda tolerance, y: jnp.stack(one(tolerance, tuple(y))[0])
+    return _of_starts(lambda tolerance, y: jax.lax.map(partial(end, tolerance), y, batch_size=SIMD))
 
 
-def by_c(problem: Problem) -> Callable:
+def by_c(problem):
     """The equations by hand in C, eight lanes side by side, one at a time alone."""
     alone, many = (peer_c.compiled(problem, width) for width in (1, SIMD))
     return lambda y: lambda tolerance: (many if len(y) >= SIMD else alone)(tolerance, y)[0]
 
 
-def by_heyoka(system: Callable[[Problem], list]) -> Callable[[Problem], Callable]:
+def by_heyoka(system):
     """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone."""
 
-    def of(problem: Problem) -> Callable:
-        made = cache(
-            lambda tolerance, width: heyoka_lowered.final_states(
-                system(problem), problem.end, tolerance, width
-            )
-        )
+    def of(problem):
+        made = cache(partial(heyoka_lowered.final_states, system(problem), problem.end))
 
         def prepared(y):
             width = SIMD if len(y) >= SIMD else 1
@@ -112,7 +100,7 @@ def by_heyoka(system: Callable[[Problem], list]) -> Callable[[Problem], Callable
     return of
 
 
-def methods(problem: Problem) -> list[tuple[str, Callable, tuple[str, ...]]]:
+def methods(problem):
     """Name, preparation, packages."""
     jax_packages = ("jax", "jaxlib", "diffrax")
     found = [
@@ -131,7 +119,7 @@ def methods(problem: Problem) -> list[tuple[str, Callable, tuple[str, ...]]]:
     return found
 
 
-def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Iterator[dict]:
+def measured(problem, quick, say):
     """Records of a problem."""
     sizes = SIZES[:2] if quick else SIZES
     expected = by_vmap(problem)(starts(problem, JUDGED))(1e-14)
@@ -151,10 +139,6 @@ def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Itera
                 found = run(tolerance)
                 error = float(np.max(np.abs(found[:JUDGED] - expected[: len(found)])))
                 each = fastest(lambda run=run, tolerance=tolerance: run(tolerance)) / size
-                say(
-                    f"  batch {size:6d}  {method:32s} {tolerance:8.1e}  error {error:9.1e}  {1e3 * each:9.4f}"
-                    " ms per trajectory"
-                )
                 yield records.record(
                     problem=problem.name, method=method, kind=kind, setting=tolerance,
                     setting_unit="tolerance", batch=size, error=error, seconds=each,

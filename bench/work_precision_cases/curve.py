@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from work_precision_cases.problem import Problem
-
 TOLERANCES = tuple(10.0**-k for k in range(4, 13))
 
 
@@ -25,8 +23,8 @@ class Solved:
 class Prepared:
     """A method ready to run: `run(setting)`, which is timed, and `read(raw)`, which is not."""
 
-    run: Callable[[float], object]
-    read: Callable[[object], Solved]
+    run: Callable
+    read: Callable
 
 
 class NotApplicable(Exception):
@@ -40,8 +38,8 @@ class Curve:
     """
 
     method: str
-    settings: tuple[float, ...]
-    prepare: Callable[[Problem], Prepared]
+    settings: tuple
+    prepare: Callable
     packages: tuple[str, ...] = ("jax", "jaxlib", "diffrax")
     kind: str = "peer"  # or "ours"
     setting_unit: str = "tolerance"  # or "step (s)"

@@ -12,6 +12,7 @@ import numpy as np
 
 try:
     import sympy as sp
+    import sympy_systems
     from sympy.physics import mechanics as me
 except ImportError:
     sp = me = None
@@ -24,51 +25,25 @@ class KaneEquations:
     """
 
     q: list
-    u: list
+    kane: object  # `u`, `mass_matrix`, `forcing`
     qdot: list
-    mass_matrix: object
-    forcing: object
     parameters: dict  # symbol -> number
-    from_minimal: Callable[[np.ndarray], np.ndarray]
-    to_minimal: Callable[[np.ndarray], np.ndarray]
-
-
-def _formed(frame, angles, speeds, kinematic, bodies, loads):
-    """The method, with its equations formed, and the rates of the angles."""
-    kane = me.KanesMethod(frame, q_ind=angles, u_ind=speeds, kd_eqs=kinematic)
-    kane.kanes_equations(bodies, loads)
-    return kane, kane.kindiffdict()
+    from_minimal: Callable
+    to_minimal: Callable
 
 
 def tilting_disc(scene) -> KaneEquations:
     """Speeds: components of the disc's angular velocity along the heading, the axle and the radius to the
     contact.
     """
-    x, y, yaw, lean, spin, w1, w2, w3 = me.dynamicsymbols("x y yaw lean spin w1 w2 w3")
-    m, a, g = sp.symbols("m a g", positive=True)
-    space = me.ReferenceFrame("S")
-    heading = space.orientnew("H", "Axis", [yaw, space.z])
-    tilted = heading.orientnew("T", "Axis", [lean, heading.x])
-    wheel = tilted.orientnew("W", "Axis", [spin, tilted.y])
-    by_rates = wheel.ang_vel_in(space)
-    wheel.set_ang_vel(space, w1 * tilted.x + w2 * tilted.y + w3 * tilted.z)
-    contact = me.Point("P")
-    contact.set_vel(space, 0)
-    centre = contact.locatenew("C", a * tilted.z)
-    centre.v2pt_theory(contact, space, wheel)
-    body = me.RigidBody(
-        "disc", centre, wheel, m, (me.inertia(tilted, m * a**2 / 4, m * a**2 / 2, m * a**2 / 4), centre)
-    )
-    kinematic = [me.dot(wheel.ang_vel_in(space) - by_rates, axis) for axis in tilted]
-    kane, rates = _formed(
-        space, [yaw, lean, spin], [w1, w2, w3], kinematic, [body], [(centre, -m * g * space.z)]
-    )
+    kane, _, _ = sympy_systems.rolling_disc()
+    kane.kanes_equations()
+    x, y = me.dynamicsymbols("x y")
+    yaw, _, spin = kane.q
+    rates = kane.kindiffdict()
+    m, a, g = (getattr(sympy_systems, name) for name in "mrg")
     forward = a * rates[spin.diff()]
-    qdot = [
-        forward * sp.cos(yaw),
-        forward * sp.sin(yaw),
-        *(rates[angle.diff()] for angle in (yaw, lean, spin)),
-    ]
+    along = forward * sp.cos(yaw), forward * sp.sin(yaw)
     numbers = {m: float(scene.mass), a: float(scene.radius), g: float(scene.gravity)}
 
     def from_minimal(s):
@@ -81,16 +56,8 @@ def tilting_disc(scene) -> KaneEquations:
         yaw_rate = s[7] / np.cos(s[3])
         return np.concatenate([s[:5], [yaw_rate, s[5], s[6] - yaw_rate * np.sin(s[3])]])
 
-    return KaneEquations(
-        [x, y, yaw, lean, spin],
-        [w1, w2, w3],
-        qdot,
-        kane.mass_matrix,
-        kane.forcing,
-        numbers,
-        from_minimal,
-        to_minimal,
-    )
+    qdot = [*along, *(rates[angle.diff()] for angle in kane.q)]
+    return KaneEquations([x, y, *kane.q], kane, qdot, numbers, from_minimal, to_minimal)
 
 
 def chaplygin_sleigh(scene) -> KaneEquations:
@@ -105,7 +72,8 @@ def chaplygin_sleigh(scene) -> KaneEquations:
     centre = blade.locatenew("C", a * body_frame.x)
     centre.v2pt_theory(blade, space, body_frame)
     body = me.RigidBody("sleigh", centre, body_frame, m, (me.inertia(body_frame, 0, 0, inertia), centre))
-    kane, _ = _formed(space, [turn], [v, w], [turn.diff() - w], [body], [])
+    kane = me.KanesMethod(space, [turn], [v, w], [turn.diff() - w])
+    kane.kanes_equations([body])
     c, s = sp.cos(turn), sp.sin(turn)
     qdot = [v * c - a * w * s, v * s + a * w * c, w]
     offset = float(scene.offset)
@@ -119,9 +87,7 @@ def chaplygin_sleigh(scene) -> KaneEquations:
         c, s = np.cos(z[2]), np.sin(z[2])
         return np.array([*z[:3], z[3] * c - offset * z[4] * s, z[3] * s + offset * z[4] * c])
 
-    return KaneEquations(
-        [x, y, turn], [v, w], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal
-    )
+    return KaneEquations([x, y, turn], kane, qdot, numbers, from_minimal, to_minimal)
 
 
 SCENES = {"tilting-disc": tilting_disc, "chaplygin-sleigh": chaplygin_sleigh}

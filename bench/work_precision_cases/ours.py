@@ -2,8 +2,7 @@
 people would call it.
 """
 
-import dataclasses
-from collections.abc import Callable
+from functools import cache
 
 import diffrax
 import jax
@@ -13,10 +12,16 @@ import numpy as np
 import jourdain_jax as jj
 from jourdain_jax.integrate.explicit_steps import order_for
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
-from work_precision_cases.problem import Problem
 
 COARSE = TOLERANCES[::2]  # 1e-4, 1e-6, ..., 1e-12
 MAX_STEPS = 200_000
+
+
+def _end(problem, start, tolerance, **options):
+    motion = jj.simulate(
+        problem.scene, start, ts=jnp.array([problem.end]), rtol=tolerance, atol=tolerance, **options
+    )
+    return motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result
 
 
 def _read(raw) -> Solved:
@@ -25,52 +30,30 @@ def _read(raw) -> Solved:
     return Solved(q=np.asarray(q), u=np.asarray(u), steps=float(accepted + rejected), failed=failed)
 
 
-def _by_simulate(solver, **options) -> Callable[[Problem], Prepared]:
+def _by_simulate(solver, **options):
     """`simulate` under the user's `jit`, the setting and the start traced: compiled once for all settings."""
 
-    def prepare(problem: Problem) -> Prepared:
-        scene, ends = problem.scene, jnp.array([problem.end])
-
-        @jax.jit
-        def compiled(setting, start):
-            motion = jj.simulate(
-                scene,
-                start,
-                ts=ends,
-                events=False,
-                max_steps=MAX_STEPS,
-                solver=solver,
-                rtol=setting,
-                atol=setting,
-                **options,
-            )
-            return motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result
-
-        start = dataclasses.replace(problem.state)
+    def prepare(problem) -> Prepared:
+        how = {"events": False, "max_steps": MAX_STEPS, "solver": solver} | options
+        compiled = jax.jit(lambda tolerance, start: _end(problem, start, tolerance, **how))
         try:
-            compiled.lower(jnp.asarray(0.01), start)
+            compiled.lower(jnp.asarray(0.01), problem.state)
         except (ValueError, TypeError) as refused:
             raise NotApplicable(str(refused).splitlines()[0]) from refused
-        return Prepared(lambda setting: jax.block_until_ready(compiled(jnp.asarray(setting), start)), _read)
+        run = lambda setting: compiled(jnp.asarray(setting), problem.state)
+        return Prepared(lambda setting: jax.block_until_ready(run(setting)), _read)
 
     return prepare
 
 
-def _by_series(problem: Problem) -> Prepared:
+def _by_series(problem) -> Prepared:
     """As `_by_simulate`, by Taylor series of the order for each tolerance."""
-    prepared = {
-        TOLERANCES[-1]: _by_simulate(jj.Taylor(order_for(TOLERANCES[-1])))(problem)
-    }  # refused where the series are too long
-
-    def run(tolerance: float):
-        if tolerance not in prepared:
-            prepared[tolerance] = _by_simulate(jj.Taylor(order_for(tolerance)))(problem)
-        return prepared[tolerance].run(tolerance)
-
-    return Prepared(run, _read)
+    prepared = cache(lambda tolerance: _by_simulate(jj.Taylor(order_for(tolerance)))(problem))
+    prepared(TOLERANCES[-1])  # refused where the series are too long
+    return Prepared(lambda tolerance: prepared(tolerance).run(tolerance), _read)
 
 
-def as_it_comes(problem: Problem) -> Prepared:
+def as_it_comes(problem) -> Prepared:
     """`simulate` called from Python with nothing chosen but the tolerance, one saved time; its Python is part
     of the time.
 
@@ -78,18 +61,13 @@ def as_it_comes(problem: Problem) -> Prepared:
     anything is timed.
     """
 
-    def run(tolerance: float):
-        motion = jj.simulate(problem.scene, problem.state, ts=[problem.end], rtol=tolerance, atol=tolerance)
-        return jax.block_until_ready(
-            (motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result)
-        )
-
+    run = lambda tolerance: jax.block_until_ready(_end(problem, problem.state, tolerance))
     for _ in range(10):
         run(TOLERANCES[0])
     return Prepared(run, _read)
 
 
-def curves(problem: Problem, quick: bool) -> list[Curve]:
+def curves(problem, quick) -> list[Curve]:
     """Those of the problem."""
     unprojected = _by_simulate(diffrax.Dopri8(), formulation=jj.Formulation(stabilisation=None))
     ways = {

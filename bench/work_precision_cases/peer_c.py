@@ -12,7 +12,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +22,6 @@ from jourdain_jax.integrate.explicit_steps import DOPRI8
 from work_precision_cases import kane
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.peer_diffrax import BY_HAND
-from work_precision_cases.problem import Problem
 
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-shared", "-fPIC")
 WIDE = "-mprefer-vector-width=512"  # of processors that have such registers
@@ -106,7 +104,7 @@ long solve(double tolerance, double end, long lanes, const double *start, double
 """
 
 
-def _rates(problem: Problem, side_by_side: int) -> tuple[int, str]:
+def _rates(problem, side_by_side):
     """How many states there are, and `rates(y, f)` of all lanes: each common subexpression once, parameters
     as numbers.
     """
@@ -143,7 +141,7 @@ def _rates(problem: Problem, side_by_side: int) -> tuple[int, str]:
     )
 
 
-def source(problem: Problem, side_by_side: int) -> str:
+def source(problem, side_by_side):
     """The whole of it."""
     (size, rates), stages = _rates(problem, side_by_side), DOPRI8.needed
     row = lambda numbers: "{" + ", ".join(repr(float(x)) for x in numbers) + "}"
@@ -158,7 +156,7 @@ def source(problem: Problem, side_by_side: int) -> str:
     )
 
 
-def library_of(source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
+def library_of(source, flags) -> ctypes.CDLL:
     """C, compiled and loaded; NotApplicable without a compiler that takes it."""
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None:
@@ -174,7 +172,7 @@ def library_of(source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
         return ctypes.CDLL(str(library))
 
 
-def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray], tuple[np.ndarray, int]]:
+def compiled(problem, side_by_side):
     """A function of a tolerance and starts, (lanes, states), that returns the states at the end, and how many
     steps were tried.
     """
@@ -185,7 +183,7 @@ def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray
         ctypes.c_long,
     )
 
-    def run(tolerance: float, starts: np.ndarray) -> tuple[np.ndarray, int]:
+    def run(tolerance, starts):
         starts = np.ascontiguousarray(starts, float)
         found = np.empty_like(starts)
         tried = solve(tolerance, problem.end, len(starts), starts.ctypes.data, found.ctypes.data)
@@ -194,7 +192,7 @@ def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray
     return run
 
 
-def _alone(problem: Problem) -> Prepared:
+def _alone(problem) -> Prepared:
     run, start = compiled(problem, 1), problem.minimal_start[None]
 
     return Prepared(
@@ -202,6 +200,6 @@ def _alone(problem: Problem) -> Prepared:
     )
 
 
-def curves(problem: Problem) -> list[Curve]:
+def curves(problem) -> list[Curve]:
     """Those of the problem."""
     return [Curve("C by hand, Dopri8", TOLERANCES, _alone, ("sympy",))] if problem.name in BY_HAND else []

@@ -12,7 +12,6 @@ import disc_body
 import numpy as np
 
 from work_precision_cases.curve import Curve, Prepared, Solved
-from work_precision_cases.problem import Problem
 
 sys.exudynFast = True  # read when it is imported
 try:
@@ -35,14 +34,13 @@ PENALTY = {
 }
 
 
-def _system(problem: Problem, penalty: bool):
+def _system(problem, penalty):
     container = exudyn.SystemContainer()
     system = container.AddSystem()
     scene, at_start = problem.scene, disc_body.start(float(problem.scene.radius), problem.minimal_start)
     m, a = float(scene.mass), float(scene.radius)
-    on_ground = system.AddMarker(
-        items.MarkerBodyRigid(bodyNumber=system.AddObject(items.ObjectGround()), localPosition=[0, 0, 0])
-    )
+    marker = lambda body: system.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=[0, 0, 0]))
+    on_ground = marker(system.AddObject(items.ObjectGround()))
     body = system.CreateRigidBody(
         inertia=RigidBodyInertia(mass=m, inertiaTensor=m * a**2 * np.diag([0.25, 0.5, 0.25]), com=[0, 0, 0]),
         referencePosition=at_start.centre.tolist(),
@@ -51,22 +49,18 @@ def _system(problem: Problem, penalty: bool):
         initialAngularVelocity=at_start.angular_velocity.tolist(),
         gravity=[0, 0, -float(scene.gravity)],
     )
-    on_disc = system.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=[0, 0, 0]))
-    rolling = {"markerNumbers": [on_ground, on_disc], "discRadius": a, "discAxis": [0, 1, 0]}
+    rolling = {"markerNumbers": [on_ground, marker(body)], "discRadius": a, "discAxis": [0, 1, 0]}
     if penalty:
         node = system.AddNode(items.NodeGenericData(initialCoordinates=[0, 0, 0], numberOfDataCoordinates=3))
-        system.AddObject(
-            items.ObjectConnectorRollingDiscPenalty(
-                **rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY
-            )
-        )
+        rolling |= PENALTY | {"nodeNumber": node, "useLinearProportionalZone": True}
+        system.AddObject(items.ObjectConnectorRollingDiscPenalty(**rolling))
     else:
         system.AddObject(items.ObjectJointRollingDisc(**rolling))
     system.Assemble()
     return container, system, body
 
 
-def _settings(problem: Problem, step: float):
+def _settings(problem, step):
     settings = exudyn.SimulationSettings()
     time, newton = settings.timeIntegration, settings.timeIntegration.newton
     time.numberOfSteps, time.endTime, time.verboseMode = round(problem.end / step), problem.end, 0
@@ -79,15 +73,15 @@ def _settings(problem: Problem, step: float):
     return settings
 
 
-def _by_exudyn(solver: str, penalty: bool = False):
-    def prepare(problem: Problem) -> Prepared:
+def _by_exudyn(solver, penalty=False):
+    def prepare(problem) -> Prepared:
         if exudyn is None:
             raise ImportError(MISSING)
         container, system, number = _system(problem, penalty)
         kind = getattr(exudyn.DynamicSolverType, solver)
         kinds = exudyn.OutputVariableType
 
-        def run(step: float):
+        def run(step):
             settings = _settings(problem, step)
             try:
                 done = system.SolveDynamic(settings, solverType=kind)  # always from the initial values
@@ -99,18 +93,12 @@ def _by_exudyn(solver: str, penalty: bool = False):
             step, failed = raw
             if failed:
                 return Solved(failed=failed)
-            position, rotation, velocity, omega = (
-                np.array(system.GetObjectOutputBody(number, kind, [0, 0, 0]))
-                for kind in (kinds.Position, kinds.RotationMatrix, kinds.Velocity, kinds.AngularVelocity)
-            )
-            body = disc_body.Body(position, rotation.reshape(3, 3), velocity, omega)
+            of = lambda kind: np.array(system.GetObjectOutputBody(number, kind, [0, 0, 0]))
+            rotation, omega = of(kinds.RotationMatrix).reshape(3, 3), of(kinds.AngularVelocity)
+            body = disc_body.Body(of(kinds.Position), rotation, of(kinds.Velocity), omega)
             q, u = disc_body.state(float(problem.scene.radius), body, problem.truth.values)
-            return Solved(
-                q=q,
-                u=u,
-                steps=float(round(problem.end / step)),
-                failed="" if np.all(np.isfinite(q)) else "not finite",
-            )
+            failed = "" if np.all(np.isfinite(q)) else "not finite"
+            return Solved(q=q, u=u, steps=float(round(problem.end / step)), failed=failed)
 
         prepared = Prepared(run, read)
         prepared.run.__dict__["keeps"] = container  # the system dies with its container
@@ -119,12 +107,11 @@ def _by_exudyn(solver: str, penalty: bool = False):
     return prepare
 
 
-def curves(problem: Problem, quick: bool) -> list[Curve]:
+def curves(problem, quick) -> list[Curve]:
     """Of the disc only; `quick`: one integrator."""
     if problem.name != "tilting-disc":
         return []
     ways = {
-        "joint, trapezoidal index 2": (STEPS, "TrapezoidalIndex2", False),
         "joint, generalized-alpha": (STEPS, "GeneralizedAlpha", False),
         "penalty, generalized-alpha": (PENALTY_STEPS, "GeneralizedAlpha", True),
     }
@@ -132,4 +119,4 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         Curve(f"Exudyn, {name}", steps, _by_exudyn(*way), ("exudyn",), setting_unit="step (s)")
         for name, (steps, *way) in ways.items()
     ]
-    return found[1:2] if quick else found
+    return found[:1] if quick else found

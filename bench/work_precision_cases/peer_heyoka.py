@@ -8,26 +8,21 @@ Mon. Not. R. Astron. Soc. 504 (2021) 2614.
 import functools
 
 import jax.numpy as jnp
-import numpy as np
 from baselines import heyoka_disc, heyoka_lowered
 from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
 from work_precision_cases.curve import Curve, Prepared, Solved
-from work_precision_cases.problem import Problem
 
 TOLERANCES = tuple(10.0**-k for k in range(4, 16, 2))
 FEWER = TOLERANCES[::2]  # every tolerance is compiled anew
-LARGE, HUGE = (
-    100,
-    1000,
-    # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes
-    # minutes
-)
+# operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes
+# minutes
+LARGE, HUGE = 100, 1000
 
 
 @functools.cache
-def states(problem: Problem) -> tuple[np.ndarray, list[int]]:
+def states(problem):
     """Start of the program's state (all speeds, where rows are kept by multipliers), and where in it the
     minimal state is.
     """
@@ -36,29 +31,24 @@ def states(problem: Problem) -> tuple[np.ndarray, list[int]]:
     return start, [names.index(name) for name in problem.minimal_names]
 
 
-def system(problem: Problem) -> list:
+def system(problem):
     """The engine's scalar program as equations of heyoka."""
     return heyoka_lowered.equations(problem.scene)
 
 
-def extended(problem: Problem) -> dict[str, float]:
+def extended(problem):
     """Coordinates and speeds at the end, integrated in long double with a tolerance of 1e-18; the speeds that
     are not integrated follow from the rows.
     """
     start, minimal = states(problem)
-    q, u = problem.completed(
-        jnp.asarray(heyoka_lowered.extended(system(problem), problem.end, start[None])[0, minimal])
-    )
-    names = (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries)
-    return dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True))
+    end = heyoka_lowered.extended(system(problem), problem.end, start[None])[0, minimal]
+    return problem.named(*problem.completed(jnp.asarray(end)))
 
 
-def _prepared(
-    problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool
-) -> Prepared:
-    solvers: dict = {}
+def _prepared(problem, equations, start, minimal, compact) -> Prepared:
+    solvers = {}
 
-    def run(tolerance: float):
+    def run(tolerance):
         if tolerance not in solvers:
             solvers[tolerance] = heyoka.taylor_adaptive(
                 equations, start.tolist(), tol=tolerance, fast_math=True, compact_mode=compact
@@ -72,23 +62,23 @@ def _prepared(
     return Prepared(run, lambda raw: Solved(y=raw[0][minimal], steps=float(raw[1])))
 
 
-def on_engines_equations(problem: Problem) -> Prepared:
+def on_engines_equations(problem) -> Prepared:
     """One integrator per tolerance."""
     return _prepared(
         problem, system(problem), *states(problem), compact=jj.lower(problem.scene).operations >= HUGE
     )
 
 
-def on_disc_by_hand(problem: Problem) -> Prepared:
+def on_disc_by_hand(problem) -> Prepared:
     """The disc's equations as an expert writes them."""
     return _prepared(problem, heyoka_disc.system(), problem.minimal_start, slice(None), compact=False)
 
 
-def _missing(problem: Problem) -> Prepared:
+def _missing(problem) -> Prepared:
     raise ImportError(MISSING)
 
 
-def curves(problem: Problem) -> list[Curve]:
+def curves(problem) -> list[Curve]:
     """Those of the problem."""
     if heyoka is None:
         return [Curve("heyoka", TOLERANCES, _missing)]

@@ -13,7 +13,6 @@ import numpy as np
 from work_precision_cases import kane
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.peer_c import library_of
-from work_precision_cases.problem import Problem
 
 try:
     import scipy.integrate
@@ -26,49 +25,36 @@ TOLERANCES = tuple(10.0**-k for k in range(4, 14))
 MOST_STEPS = 1_000_000
 
 
-def c_source(equations: kane.KaneEquations) -> str:
+def c_source(equations: kane.KaneEquations):
     """`void rates(double t, const double *y, double *dy)`: everything after common subexpressions, the
     symmetric system solved in closed form.
     """
-    sp, n, m = kane.sp, len(equations.q), len(equations.u)
+    sp, formed, n, m = kane.sp, equations.kane, len(equations.q), len(equations.kane.u)
     y = sp.symbols(f"y:{n + m}")
-    plain = dict(zip([*equations.q, *equations.u], y, strict=True))
-    entries = {
-        (i, j): equations.mass_matrix[i, j]
-        for i in range(m)
-        for j in range(i + 1)
-        if equations.mass_matrix[i, j] != 0
-    }
+    plain = dict(zip([*equations.q, *formed.u], y, strict=True))
+    lower = ((i, j) for i in range(m) for j in range(i + 1))
+    entries = {at: formed.mass_matrix[at] for at in lower if formed.mass_matrix[at] != 0}
     places = {at: sp.Symbol(f"M{at[0]}{at[1]}") for at in entries}
     forces = sp.symbols(f"f:{m}")
     matrix = sp.Matrix(m, m, lambda i, j: places.get((max(i, j), min(i, j)), 0))
     targets = [*(f"dy[{i}]" for i in range(n)), *map(str, places.values()), *map(str, forces)]
     shared, found = sp.cse(
-        [sp.sympify(e).subs(plain) for e in (*equations.qdot, *entries.values(), *equations.forcing)],
+        [sp.sympify(e).subs(plain) for e in (*equations.qdot, *entries.values(), *formed.forcing)],
         sp.numbered_symbols("s"),
     )
     solving, solved = sp.cse(list(matrix.LUsolve(sp.Matrix(forces))), sp.numbered_symbols("z"))
-    code = sp.ccode
-    lines = [
-        f"const double {name} = {value!r};"
-        for name, value in ((str(s), v) for s, v in equations.parameters.items())
-    ]
+    targets += [*(name for name, _ in solving), *(f"dy[{n + i}]" for i in range(m))]
+    values = [*(value for _, value in shared), *found, *(value for _, value in solving), *solved]
+    names = [*(name for name, _ in shared), *targets]
+    lines = [f"const double {name} = {value!r};" for name, value in equations.parameters.items()]
     lines += [f"const double y{i} = y[{i}];" for i in range(n + m)]
-    lines += [f"const double {name} = {code(value)};" for name, value in shared]
-    lines += [
-        f"{'' if target.startswith('dy') else 'const double '}{target} = {code(value)};"
-        for target, value in zip(targets, found, strict=True)
-    ]
-    lines += [f"const double {name} = {code(value)};" for name, value in solving]
-    lines += [f"dy[{n + i}] = {code(value)};" for i, value in enumerate(solved)]
-    return (
-        "#include <math.h>\nvoid rates(double t, const double *y, double *dy) {\n    "
-        + "\n    ".join(lines)
-        + "\n}\n"
-    )
+    for name, value in zip(map(str, names), values, strict=True):
+        lines.append(f"{'const double ' * (name[:2] != 'dy')}{name} = {sp.ccode(value)};")
+    body = "\n    ".join(lines)
+    return f"#include <math.h>\nvoid rates(double t, const double *y, double *dy) {{\n    {body}\n}}\n"
 
 
-def compiled(source: str):
+def compiled(source):
     """The shared library; NotApplicable without a C compiler."""
     library = library_of(source, FLAGS)
     library.rates.argtypes, library.rates.restype = [ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p], None
@@ -78,7 +64,7 @@ def compiled(source: str):
 _made: dict[str, tuple] = {}
 
 
-def _equations(problem: Problem) -> tuple:
+def _equations(problem):
     if scipy is None or kane.sp is None:
         raise ImportError(MISSING)
     if problem.name not in _made:
@@ -87,7 +73,7 @@ def _equations(problem: Problem) -> tuple:
     return _made[problem.name]
 
 
-def callback(library, size: int):
+def callback(library, size):
     """The rates as SciPy calls them; every integrator of SciPy copies what it is given, so that one output
     array serves.
     """
@@ -101,13 +87,13 @@ def callback(library, size: int):
     return rates
 
 
-def _by_ode(name: str):
-    def prepare(problem: Problem) -> Prepared:
+def _by_ode(name):
+    def prepare(problem) -> Prepared:
         equations, library = _equations(problem)
         start = equations.from_minimal(problem.minimal_start)
         rates = callback(library, len(start))
 
-        def run(tolerance: float):
+        def run(tolerance):
             # the state that SciPy hands over is contiguous float64
             solver = scipy.integrate.ode(rates).set_integrator(
                 name, rtol=tolerance, atol=tolerance, nsteps=MOST_STEPS
@@ -120,7 +106,7 @@ def _by_ode(name: str):
     return prepare
 
 
-def curves(problem: Problem, quick: bool = False) -> list[Curve]:
+def curves(problem, quick=False) -> list[Curve]:
     """Those of the problem: the disc and the sleigh."""
     if problem.name not in kane.SCENES:
         return []

@@ -18,7 +18,7 @@ class Reference:
     them.
     """
 
-    values: dict[str, float]
+    values: dict
     how: str
     uncertainty: float = float("nan")
     against: str = "nothing else"
@@ -30,11 +30,11 @@ class Problem:
 
     name: str
     title: str
-    make_scene: Callable[[], jj.Scene]
+    make_scene: Callable
     start: dict
     end: float  # s
-    reference: Callable[["Problem"], Reference]
-    compared: tuple[str, ...]  # names of coordinates and speeds
+    reference: Callable
+    compared: str  # names of coordinates and speeds
 
     @functools.cached_property
     def scene(self) -> jj.Scene:
@@ -47,18 +47,18 @@ class Problem:
         return jj.start(self.scene, **self.start)
 
     @functools.cached_property
-    def independent(self) -> tuple[int, ...]:
+    def independent(self):
         """Numbers of the privileged speeds."""
         return tuple(jj.structure_of(self.scene).independent)
 
     @property
-    def minimal_names(self) -> tuple[str, ...]:
+    def minimal_names(self):
         """Coordinates and privileged speeds."""
         speeds = self.scene.speed_names.entries
         return (*self.scene.coordinate_names.entries, *(speeds[i] for i in self.independent))
 
     @functools.cached_property
-    def minimal_start(self) -> np.ndarray:
+    def minimal_start(self):
         """The start in coordinates and privileged speeds."""
         return np.concatenate([self.state.q, np.asarray(self.state.u)[list(self.independent)]])
 
@@ -68,7 +68,7 @@ class Problem:
         return self.reference(self)
 
     @functools.cached_property
-    def completed(self) -> Callable:
+    def completed(self):
         """A function of coordinates and privileged speeds at the end that returns coordinates and all
         speeds.
         """
@@ -78,16 +78,18 @@ class Problem:
             lambda y: (y[:n], minimal_kinematics(scene, self.independent, rows, end, y[:n], y[n:]).u)
         )
 
-    def error(self, q, u) -> float:
+    def error(self, q, u):
         """The largest absolute difference of a final state from the reference over the quantities compared,
         SI units.
         """
+        return largest_error(self.named(q, u), self.truth.values, self.compared.split())
+
+    def named(self, *values):
+        """Coordinates and speeds by name."""
         names = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries)
-        return largest_error(
-            dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True)), self.truth.values, self.compared
-        )
+        return dict(zip(names, np.concatenate(values), strict=True))
 
 
-def largest_error(found: dict, expected: dict[str, float], names: tuple[str, ...]) -> float:
+def largest_error(found, expected, names):
     """The largest absolute difference over the quantities named; NaN where one is not finite."""
     return float(np.max([abs(float(found[name]) - float(expected[name])) for name in names]))

@@ -7,7 +7,7 @@ from work_precision_cases import references
 from work_precision_cases.problem import Problem
 
 
-def _of(run: dict, *names: str) -> dict:
+def _of(run, *names):
     return {name: run[name] for name in names}
 
 
@@ -23,7 +23,7 @@ PROBLEMS = {
             _of(rolling_disc.RUN, "lean", "yaw_rate", "lean_rate", "spin_rate"),
             rolling_disc.RUN["t_end"],
             references.disc,
-            ("x", "y", "yaw", "lean", "spin", "yaw_rate", "lean_rate", "spin_rate"),
+            "x y yaw lean spin yaw_rate lean_rate spin_rate",
         ),
         Problem(
             "chaplygin-sleigh",
@@ -34,7 +34,7 @@ PROBLEMS = {
             {"x_rate": _SLEIGH["v0"], "y_rate": _SLEIGH["a"] * _SLEIGH["w0"], "heading_rate": _SLEIGH["w0"]},
             _SLEIGH["t_end"],
             references.sleigh,
-            ("x", "y", "heading", "x_rate", "y_rate", "heading_rate"),
+            "x y heading x_rate y_rate heading_rate",
         ),
         Problem(
             "rattleback",
@@ -45,7 +45,7 @@ PROBLEMS = {
             _of(rattleback.RUN, *rattleback.NAMES),
             rattleback.RUN["t_end"],
             references.celt,
-            rattleback.NAMES,
+            " ".join(rattleback.NAMES),
         ),
         Problem(
             "whipple-bicycle",
@@ -54,19 +54,7 @@ PROBLEMS = {
             dict(jj.models.WhippleBicycle.example),
             5.0,
             references.bicycle,
-            (
-                "x",
-                "y",
-                "yaw",
-                "lean",
-                "pitch",
-                "steer",
-                "rear_spin",
-                "front_spin",
-                "lean_rate",
-                "steer_rate",
-                "rear_spin_rate",
-            ),
+            "x y yaw lean pitch steer rear_spin front_spin lean_rate steer_rate rear_spin_rate",
         ),
     )
 }

@@ -4,11 +4,12 @@ import platform
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 
-OURS, PEER = "ours", "peer"
-KINDS = (OURS, PEER)
+from figures import figure
+
+OURS, PEER = KINDS = ("ours", "peer")
 
 
-def versions(*names: str) -> dict[str, str]:
+def versions(*names):
     """Versions of the packages that took part and are installed, Python's among them."""
     found = {"python": platform.python_version()}
     for name in names:
@@ -29,26 +30,21 @@ class Record:
     setting: float  # a tolerance (absolute and relative) or a step in s, as `setting_unit` says
     setting_unit: str
     batch: int  # trajectories computed together
-    error: (
-        float | None
-    )  # the largest over the final quantities compared, absolute in SI units; None where the run failed
+    # the largest over the final quantities compared, absolute in SI units; None where the run failed
+    error: float | None
     seconds: float  # wall time per trajectory, warm
     steps: float | None = None  # per trajectory; None where they are not counted
     note: str = ""
-    versions: dict[str, str]
+    versions: dict
 
 
-FIGURE = ("figure", "model", "value", "required", "met")  # as in the other scripts: error, nothing required
-KEYS = (*FIGURE, *(field.name for field in fields(Record)))
+KEYS = (*figure("", "", None), *(field.name for field in fields(Record)))
 
 
-def record(**values) -> dict:
+def record(**values):
     """A measurement as JSON holds it."""
     if values["kind"] not in KINDS:
         raise ValueError(f"`kind` is {values['kind']!r}, expected one of {KINDS}")
-    found = {
-        key: None if isinstance(value, float) and value != value else value
-        for key, value in asdict(Record(**values)).items()
-    }
+    found = {key: None if value != value else value for key, value in asdict(Record(**values)).items()}
     name = "error, {method}, {setting:g} {setting_unit}, {batch} at once".format(**found)
-    return dict(zip(FIGURE, (name, found["problem"], found["error"], None, True), strict=True)) | found
+    return figure(name, found["problem"], found["error"]) | found

@@ -16,41 +16,35 @@ from oracles import chaplygin_sleigh, rattleback, rolling_disc
 
 import jourdain_jax as jj
 from work_precision_cases import peer_heyoka
-from work_precision_cases.problem import Problem, Reference, largest_error
+from work_precision_cases.problem import Reference, largest_error
 
 TIGHT = 1e-14
 
 
-def by_engine(problem: Problem) -> dict[str, float]:
+def by_engine(problem):
     """The engine's own end, at a tolerance of 1e-14; not inside `jit`, where a motion that fails is not run
     again in another way.
     """
     options = {"ts": jnp.array([problem.end]), "rtol": TIGHT, "atol": TIGHT, "events": False}
     motion = jj.simulate(problem.scene, problem.state, solver=diffrax.Dopri8(), **options).raise_if_failed()
-    return dict(
-        zip(
-            (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries),
-            (*motion.q_end, *motion.u_end),
-            strict=True,
-        )
-    )
+    return problem.named(motion.q_end, motion.u_end)
 
 
-def second(problem: Problem) -> tuple[dict[str, float], str]:
+def second(problem):
     """Another computation of the end."""
     if peer_heyoka.heyoka is not None:
         return peer_heyoka.extended(problem), "heyoka, extended precision, the engine's equations"
     return by_engine(problem), "the engine, Dopri8 at 1e-14"
 
 
-def checked(problem: Problem, values: dict[str, float], how: str) -> Reference:
+def checked(problem, values, how) -> Reference:
     """Values with the largest difference from a second computation."""
     other, by = second(problem)
-    names = tuple(name for name in problem.compared if name in other)
+    names = tuple(name for name in problem.compared.split() if name in other)
     return Reference(values, how, largest_error(other, values, names), by)
 
 
-def disc(problem: Problem) -> Reference:
+def disc(problem) -> Reference:
     """Euler's equations in Appell's variables, by the oracle."""
     found = rolling_disc.motion_yaw_lean_spin([0.0, problem.end], **rolling_disc.RUN)
     values = {name: found[name][-1] for name in ("x", "y", "yaw", "lean", "spin")}
@@ -59,57 +53,36 @@ def disc(problem: Problem) -> Reference:
     return checked(problem, values, "Appell's equations, extrapolation of order 18 in extended precision")
 
 
-def sleigh(problem: Problem) -> Reference:
+def sleigh(problem) -> Reference:
     """Closed form; the path by quadrature."""
-    found = {
-        name: values[-1]
-        for name, values in chaplygin_sleigh.motion(
-            [0.0, problem.end], **_without(chaplygin_sleigh.RUN, "t_end")
-        ).items()
-    }
-    c, s, a = np.cos(found["th"]), np.sin(found["th"]), chaplygin_sleigh.RUN["a"]
-    values = {"x": found["x"], "y": found["y"], "heading": found["th"], "heading_rate": found["w"]}
-    values |= {"x_rate": found["v"] * c - a * found["w"] * s, "y_rate": found["v"] * s + a * found["w"] * c}
+    run = chaplygin_sleigh.RUN
+    found = chaplygin_sleigh.motion([0.0, problem.end], **_without(run, "t_end"))
+    x, y, th, v, w = (found[name][-1] for name in ("x", "y", "th", "v", "w"))
+    c, s, across = np.cos(th), np.sin(th), run["a"] * w
+    values = {"x": x, "y": y, "heading": th, "heading_rate": w}
+    values |= {"x_rate": v * c - across * s, "y_rate": v * s + across * c}
     return checked(problem, values, "closed form; path by Gauss-Legendre quadrature")
 
 
-def celt(problem: Problem) -> Reference:
+def celt(problem) -> Reference:
     """Kane and Levinson's equations, by the oracle."""
     found = rattleback.motion([0.0, problem.end], **_without(rattleback.RUN, "t_end"))
     values = {name: found[name][-1] for name in rattleback.NAMES}
-    return checked(
-        problem, values, "Kane and Levinson's equations, extrapolation of order 18 in extended precision"
-    )
+    how = "Kane and Levinson's equations, extrapolation of order 18 in extended precision"
+    return checked(problem, values, how)
 
 
-def bicycle(problem: Problem) -> Reference:
+def bicycle(problem) -> Reference:
     """No closed form: heyoka on the engine's equations against dense autodiff of poses written by hand, or
     the engine against the latter.
     """
-    if peer_heyoka.heyoka is None:
-        values, how = by_engine(problem), "the engine, Dopri8 at 1e-14"
-    else:
-        values, how = peer_heyoka.extended(problem), "heyoka, extended precision, the engine's equations"
-    y = np.concatenate([problem.state.q, problem.state.u])
-    found = jax.jit(
-        lambda y: dense.integrate(
-            dense.bicycle_rates, dense.BICYCLE_PARAMETERS, y, problem.end, "Dopri8", 1e-13
-        )
-    )(y[None])[0]
-    other = dict(
-        zip(
-            (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries),
-            np.asarray(found),
-            strict=True,
-        )
-    )
-    return Reference(
-        values,
-        how,
-        largest_error(other, values, problem.compared),
-        "dense autodiff of poses by hand, diffrax Dopri8 at 1e-13",
-    )
+    values, how = second(problem)
+    rates, parameters = dense.bicycle_rates, dense.BICYCLE_PARAMETERS
+    integrated = jax.jit(lambda y: dense.integrate(rates, parameters, y, problem.end, tolerance=1e-13))
+    found = np.asarray(integrated(np.concatenate([problem.state.q, problem.state.u])[None])[0])
+    off = largest_error(problem.named(found), values, problem.compared.split())
+    return Reference(values, how, off, "dense autodiff of poses by hand, diffrax Dopri8 at 1e-13")
 
 
-def _without(values: dict, *names: str) -> dict:
+def _without(values, *names):
     return {name: value for name, value in values.items() if name not in names}
