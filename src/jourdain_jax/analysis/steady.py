@@ -41,6 +41,7 @@ from jourdain_jax.calculus.reals import (
     static,
 )
 from jourdain_jax.calculus.roots import smooth_root
+from jourdain_jax.equations.contact_laws import SLOW, moves
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.phases import At, contacts_at_start
 from jourdain_jax.integrate.state_projection import State, state_of
@@ -49,7 +50,7 @@ from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, as_time, shown_from_users_lines
 from jourdain_jax.scene.coordinates import Labels, as_names, check_names
-from jourdain_jax.scene.modes import FLIES, ROLLS, SLIPS, Switching, switched
+from jourdain_jax.scene.modes import SLIPS, Switching, switched
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -162,19 +163,22 @@ def in_phase(scene: Scene, t, q, u, f) -> tuple:
     known = numbers_where_known((scene, t, q, u, f))
     unclear = known is None or scene.switching.rows
     modes = () if unclear else tuple(zip(names, _modes(*known).tolist(), strict=False))
-    if not modes or not {FLIES, ROLLS, SLIPS}.issuperset(dict(modes).values()):
+    if not modes or min(dict(modes).values()) < 0:
         raise ValueError(
             f"contacts with friction of `{type(scene).__name__}` ({', '.join(names)}) must fly, roll or slip "
             "in a state whose numbers are known, outside `jit` and `vmap`; velocity constraints that may "
             "slip are not supported"
         )
     phase = switched(scene, Switching(phase=modes))
-    return phase, q[: len(phase.coordinate_names)], f[: len(phase.inputs)]
+    return phase, q[: len(phase.coordinate_names)], f[1 : 1 + len(phase.inputs)]
 
 
 @eval_numpy
 def _modes(scene: Scene, t, q, u, f):
-    return contacts_at_start(At(scene, motion_at(scene, t, q, u, f)))
+    at = At(scene, motion_at(scene, t, q, u, f))
+    numbers = contacts_at_start(at)[: len(at.w)]
+    # slip that begins has no direction yet
+    return jnp.where((numbers == SLIPS) & ~moves(at.w, SLOW), -1.0, numbers)
 
 
 def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:

@@ -26,7 +26,7 @@ from jourdain_jax.calculus.reals import ContactFlags, ContactVectors, Flag, PerC
 # SWEEPS: Gauss-Seidel sweeps per contact; STEPS: Newton steps for one contact, one more for each
 # further contact
 SWEEPS, STEPS = 4, 5  # numerics
-SLOW = 5e-6  # numerics, m/s: slower slip changes its direction as if it had this speed
+SLOW = 1e-5  # numerics, m/s: least speed s of `slip_turns`; a motion does not start with slower slip
 ROUND_OFF = 1e-9  # numerics: relative, of responses
 LEAST_SLIP = 1e-8  # numerics, m/s: round-off of speeds that impulses change
 DIFFERS = 1e-6  # numerics: relative difference of responses from which on two solutions differ

@@ -1,25 +1,21 @@
 """Contacts that fly, roll, slip and strike: the end of each phase, and the next one.
 
-    M du/dt = h + A' L       L: forces,  w = dg/dt and slip,  n, t: normal and tangential parts,  s: `SLOW`
+    M du/dt = h + A' L       L: forces,  w = dg/dt and slip,  n, t: normal and tangential parts
 
     flies       L = 0
     rolls       dw/dt = 0
     slips       dw_n/dt = 0,  L_t = -mu L_n e,  e along w_t
-    creeps      slips more slowly than s
 
-    event       normal          tangent                      speed
+    event       normal          tangent                      law
     flies       gap
     rolls       L_n             (mu_s L_n)^2 - |L_t|^2
-    slips       L_n             e.w_t - s                    1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
-    creeps      L_n             e.w_t                        2 s - e.w_t
+    slips       L_n             e.w_t                        1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
 
 A phase ends when one of the values in its line falls through zero; the head of the column names the event.
-The event `speed` also ends the motion of a disc or wheel that falls flat. If forces jump beyond their bounds,
+The event `law` ends the motion, also of a disc or wheel that falls flat. If forces jump beyond their bounds,
 as at the edge of a kerb, `after` chooses all modes.
 
-The direction of slip e is part of the state, with the rate `n (n.dw_t/dt)/(e.w_t)`, n = e rotated by a right
-angle (`slip_turns`). Errors of w_t across e therefore do not change e. The rate has no limit at rest: below
-the speed s, s replaces e.w_t.
+The direction of slip e is part of the state (`slip_turns`), so errors of w_t across e do not change it.
 
 When a contact closes, the impact changes speeds, modes and directions of slip:
 
@@ -71,7 +67,6 @@ from jourdain_jax.equations.virtual_power import (
 )
 from jourdain_jax.scene.modes import (
     AMBIGUOUS,
-    CREEPS,
     FLAT,
     FLIES,
     GAINS_ENERGY,
@@ -203,15 +198,14 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
 
     touches = jnp.where(goes_on, closed, (closed | strikes) & (w[:, 0] < LEAST_SLIP))
-    slides = touches & jnp.where(goes_on, at.number >= SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
+    slides = touches & jnp.where(goes_on, at.number == SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
     e = jnp.where((slides & ~goes_on)[:, None], unit(w[:, 1:]), at.modes.direction)
-    numbers = jnp.where(slides, jnp.where(moves(w, SLOW), SLIPS, CREEPS), ROLLS)
-    then = at.then(jnp.where(touches, numbers, FLIES), e, motion.q.array, u)
+    numbers = jnp.where(touches, jnp.where(slides, SLIPS, ROLLS), FLIES)
+    then = at.then(numbers, e, motion.q.array, u)
     zero = jnp.zeros_like(at.friction)
     response = then.found.G, then.found.b, zero, then.friction, then.static
     rest = coulomb(Law(*response, touches, slides, begins, e))
-    numbers = jnp.where(slides, numbers, jnp.where(rest.modes.rolls > 0, ROLLS, CREEPS))
-    numbers = jnp.where(rest.modes.closed > 0, numbers, FLIES)
+    numbers = jnp.where(rest.modes.closed > 0, jnp.where(rest.modes.rolls > 0, ROLLS, SLIPS), FLIES)
     bounces = strikes & (numbers == FLIES) & (at.w[:, 0] < -w[:, 0])
     falls = -(then.found.G @ rest.P.ravel() + then.found.b)[::3]
     share = 1 + w[:, 0] / jnp.where(bounces, at.w[:, 0], 1.0)
@@ -221,7 +215,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     waits = jnp.where(((at.number == FLIES) & ~hits)[:, None], at.slots, 0.0)
     waits = jnp.where(bounces[:, None], jnp.stack([w[:, 0], zero], axis=1), waits)
     waits = jnp.where(settles[:, None], jnp.stack([rests, zero + 1], axis=1), waits)
-    slots = jnp.where((numbers >= SLIPS)[:, None], rest.modes.direction, waits)
+    slots = jnp.where((numbers == SLIPS)[:, None], rest.modes.direction, waits)
 
     has_law = jnp.all(rest.holds) & (~hits | has_law)
     flat = [] if (above := at.above_flat[i]) is None else [((touches | strikes)[i] & (above < 0), FLAT)]
@@ -252,18 +246,14 @@ def contact_events(at: At) -> dict[str, Scalar]:
         bound, along = at.static[i] * normal, at.modes.direction[i] @ slip
         ahead = jnp.where(at.settles[i], at.slots[i, 0] - at.motion.t, at.found.rows.gap[i])
         events[f"{name} normal"] = jnp.where(number == FLIES, ahead, normal)
-        while_closed = along - jnp.where(number == SLIPS, SLOW, -STOPS)
-        events[f"{name} tangent"] = jnp.where(
-            number == FLIES,
-            one,
-            jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed),
-        )
+        holds = bound * bound - tangential @ tangential
+        while_closed = jnp.where(number == ROLLS, holds, along + STOPS)
+        events[f"{name} tangent"] = jnp.where(number == FLIES, one, while_closed)
         bears, stands = _bearing(at, i) - NEARLY, one
         if (above := at.above_flat[i]) is not None:
             stands = jnp.where(number == ROLLS, above, one)
             bears = bears * above / jnp.sqrt(bears**2 + above**2)  # zero with either factor
-        while_slips = jnp.where(number == SLIPS, bears, stands)
-        events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, while_slips)
+        events[f"{name} law"] = jnp.where(number == SLIPS, bears, stands)
     return events
 
 
@@ -276,24 +266,23 @@ def contact_changes(at: At) -> dict[str, Event]:
     values, size = contact_events(at), jnp.sum(jnp.abs(switching_forces(at.scene, at.motion, at.found)))
     for i, name in enumerate(names):
         number, own = at.number[i], jnp.arange(len(names)) == i
-        strikes, stops, e = number == FLIES, number == CREEPS, at.modes.direction[i]
-        rolls, normal, tangent = number == ROLLS, values[f"{name} normal"], values[f"{name} tangent"]
+        normal, tangent = values[f"{name} normal"], values[f"{name} tangent"]
+        strikes, rolls, stops = number == FLIES, number == ROLLS, (number == SLIPS) & (tangent < LEAST_SLIP)
         breaks = (~strikes & (normal < -ROUND_OFF * size)) | (rolls & (tangent < -ROUND_OFF * size**2))
         met = own | together if at.rows[i].impact == "moreau" else own
         found = after(at, i, strikes & (at.number == FLIES) & met, own & stops, own & rolls & ~breaks)
         ends = PAINLEVE
         if (above := at.above_flat[i]) is not None:
             ends = jnp.where(above < FLAT_BELOW, FLAT, ends)
-        faster = _speeds_on_rows(at, at.number.at[i].set(SLIPS))
-        for what, jumps, mode, slot, u in (
-            ("normal", strikes | breaks, FLIES, jnp.zeros(2), now),
+        for what, jumps, mode, slot in (
+            ("normal", strikes | breaks, FLIES, jnp.zeros(2)),
             # at the start of slip the law at rest gives the direction, even if it sticks by round-off
-            ("tangent", stops | breaks, CREEPS, jnp.where(number == SLIPS, e, found.direction), now),
-            ("speed", False, jnp.where(stops, SLIPS, ends), e, faster),
+            ("tangent", stops | breaks, SLIPS, found.direction),
+            ("law", False, ends, at.slots[i]),
         ):
             numbers = jnp.where(jumps, found.numbers, at.number.at[i].set(mode))
             slots = jnp.where(jumps, found.slots, at.slots.at[i].set(slot))
-            jump = dict(zip(at.scene.speed_names.entries, jnp.where(jumps, found.u, u), strict=True))
+            jump = dict(zip(at.scene.speed_names.entries, jnp.where(jumps, found.u, now), strict=True))
             jump |= {f"{other}_slip_{k}": slots[j, k - 1] for j, other in enumerate(names) for k in (1, 2)}
             to = dict(zip(names, numbers, strict=True))
             events[f"{name} {what}"] = Event(jnp.ones_like(at.motion.t), to=to, jump=jump)
@@ -301,10 +290,10 @@ def contact_changes(at: At) -> dict[str, Event]:
 
 
 def put_back(at: At) -> tuple[PerCoordinate, Speeds]:
-    """Return coordinates on the ground, with directions of slip e of length one, and speeds that satisfy the
-    laws of closed contacts.
+    """Return coordinates on the ground, with directions of slip e of length one, and speeds at which closed
+    contacts do not open and rolling contacts do not slip.
 
-        q - D' (D D')^-1 gap,  D = d gap/dq;       e/|e|;       u by `_speeds_on_rows`
+        q - D' (D D')^-1 gap,  D = d gap/dq;       e/|e|;       u + M^-1 A' P
     """
     scene, motion, modes = at.scene, at.motion, at.modes
     q, closed = motion.q.array, modes.closed
@@ -317,22 +306,8 @@ def put_back(at: At) -> tuple[PerCoordinate, Speeds]:
     moved = solved(list(D @ D.T + jnp.diag(1 - closed)), list(gaps(q)[:, None]))
     q = q - jnp.concatenate(moved) @ D
     e = jnp.where((closed > 0)[:, None], unit(modes.direction), at.slots)
-    return with_slots(q, e), _speeds_on_rows(at, at.number)
-
-
-def _speeds_on_rows(at: At, number: PerContact) -> Speeds:
-    """Return `u + M^-1 A' T P` with `(T G T + 1 - T) P = -T w`, for contacts in the modes `number`.
-
-    T projects the speeds w onto the parts that must vanish: normal speeds of closed contacts, slip of rolling
-    contacts, and slip across e of slipping contacts.
-    """
-    found, blocks = at.found, []
-    for closed, rolls, e, slips in zip(*at.modes, number == SLIPS, strict=True):
-        n = jnp.where(slips, jnp.stack([-e[1], e[0]]), 0.0)
-        blocks.append(jnp.diag(jnp.stack([closed, rolls, rolls])).at[1:, 1:].add(jnp.outer(n, n)))
-    T = jax.scipy.linalg.block_diag(*blocks)
-    P = solved(list(T @ found.G @ T + jnp.eye(len(T)) - T), list(-(T @ found.rows.w)[:, None]))
-    return at.motion.u.array + found.impulses @ T @ jnp.concatenate(P)
+    P = responses(at.found.G, at.found.rows.w[:, None], modes, 0.0 * at.friction)[:, 0]
+    return with_slots(q, e), motion.u.array + at.found.impulses @ P
 
 
 def contacts_at_start(at: At) -> Float[Array, "numbers"]:

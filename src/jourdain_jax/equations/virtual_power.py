@@ -277,28 +277,34 @@ def numbers_and_slots(scene: Scene, motion: Motion) -> tuple[PerContact, Float[A
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
     """Return the modes of the switching contacts and their directions of slip, which are part of the state.
-    The direction is zero unless a contact slips or creeps.
+    The direction is zero unless a contact slips.
     """
     number, slots = numbers_and_slots(scene, motion)
     one = jnp.ones_like(number)
     return Modes(
         jnp.where(number == FLIES, 0.0, one),
         jnp.where(number == ROLLS, one, 0.0),
-        slots * (number >= SLIPS)[:, None],
+        slots * (number == SLIPS)[:, None],
     )
 
 
 def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
-    """Return rates of the directions of slip e, 1/s; zero unless a contact slips or creeps.
+    """Return rates of the directions of slip e, 1/s; zero unless a contact slips.
 
-    de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, or `SLOW` if creeping
+    de/dt = n n.(dw_t/dt + k w_t/4v)/v,   v^4 = (e.w_t)^4 + s^4,   k = mu L_n n.G_tt n
+
+    n: e turned by a right angle. At speeds above s, v is |w_t|, and w_t stays along e. At lower speeds, friction
+    takes e to the direction with n.dw_t/dt = 0 at the rate k/v, and the term with k, of critical damping, takes
+    w_t to e.
     """
-    e, (number, _) = contact_modes(scene, motion).direction, numbers_and_slots(scene, motion)
-    dw = (found.G @ switching_forces(scene, motion, found) + found.b).reshape(-1, 3)[:, 1:]
-    along = jnp.sum(e * found.rows.w.reshape(-1, 3)[:, 1:], axis=1)
-    aside = e[:, 0] * dw[:, 1] - e[:, 1] * dw[:, 0]
-    rate = aside / jnp.where(number == SLIPS, along, SLOW)
-    return (rate[:, None] * jnp.stack([-e[:, 1], e[:, 0]], axis=1)).ravel()
+    e, L = contact_modes(scene, motion).direction, switching_forces(scene, motion, found)
+    n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
+    w, dw = (x.reshape(-1, 3)[:, 1:] for x in (found.rows.w, found.G @ L + found.b))
+    own = [found.G[i : i + 2, i : i + 2] for i in range(1, len(L), 3)]
+    friction = jnp.stack([law.sliding for _, law, _ in switching_rows(scene, motion).values()])
+    k = friction * L[::3] * jnp.stack([n @ G @ n for n, G in zip(n, own, strict=True)])
+    v = jnp.sqrt(jnp.sqrt(jnp.sum(e * w, axis=1) ** 4 + motion.inputs.slow_slip**4 + SLOW**4))[:, None]
+    return (n * jnp.sum(n * (dw + k[:, None] * w / (4 * v)) / v, axis=1, keepdims=True)).ravel()
 
 
 def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> PerCoordinate:

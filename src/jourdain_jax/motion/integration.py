@@ -21,7 +21,7 @@ from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
 from jourdain_jax.integrate.event_search import RUNNING
-from jourdain_jax.integrate.inputs import Inputs, Mode, for_programs, in_phases
+from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, for_programs, in_phases
 from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
@@ -130,10 +130,12 @@ def _in_contact(setup: Setup) -> Setup:
     numbers, below, q, u = jnp.split(found, (count, count + 1, count + 1 + len(start.q)))
     residual = jnp.maximum(start.residual, jax.lax.stop_gradient(below[0]))
     modes = tuple(Mode(jax.lax.stop_gradient(number)) for number in numbers)
-    channels = setup.inputs.channels[: len(setup.inputs.channels) - count]
+    # errors of speeds by slow slip are of the order of its square
+    slow = Constant(jnp.sqrt(jax.lax.stop_gradient(setup.tolerances[1])))
+    channels = setup.inputs.channels[1 : len(setup.inputs.channels) - count]
     return setup._replace(
         start=eqx.tree_at(lambda s: (s.q, s.u, s.residual), start, (q, u, residual)),
-        inputs=Inputs((*channels, *modes)),
+        inputs=Inputs((slow, *channels, *modes)),
     )
 
 

@@ -12,13 +12,14 @@ Which contacts have friction depends only on the structure of the scene, and is 
 structure. Velocity constraints that hold until their force exceeds a limit count as contacts; "rolls" is then
 called "holds". For a contact `rim` the scene gets
 
-    mode `rim`                                     flies, rolls, slips, creeps
-    events `rim normal`, `rim tangent`, `rim speed`
+    mode `rim`                                     flies, rolls, slips
+    events `rim normal`, `rim tangent`, `rim law`
     coordinates `rim_slip_1`, `rim_slip_2`         its direction while it slips; else zero, or the speed
                                                    of its last rebound, and 0; during the last flight of
                                                    its bounces the time at which they end, and 1
 
-`equations/phases.py` has the mechanics.
+and one input for all contacts, `slow_slip` (m/s): the speed below which a slip changes its direction as if it
+had this speed. `equations/phases.py` has the mechanics.
 """
 
 from collections.abc import Mapping
@@ -116,12 +117,12 @@ class Event:
     stop: bool = False
 
 
-FLIES, ROLLS, SLIPS, CREEPS = map(float, range(4))
+FLIES, ROLLS, SLIPS = map(float, range(3))
 # values of a mode that tell why a motion cannot continue, in the order of the result codes
 GAINS_ENERGY, PAINLEVE, UNDECIDED, FLAT, _, _, AMBIGUOUS = map(float, range(-1, -8, -1))
-MODES_OF_CONTACT = ("flies", "rolls", "slips", "creeps")
-MODES_OF_ROW = ("flies", "holds", "slips", "creeps")  # a constraint never flies
-EVENTS_OF_CONTACT = ("normal", "tangent", "speed")
+MODES_OF_CONTACT = ("flies", "rolls", "slips")
+MODES_OF_ROW = ("flies", "holds", "slips")  # a constraint never flies
+EVENTS_OF_CONTACT = ("normal", "tangent", "law")
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ def switching_of(scene) -> Switching:
     return Switching(
         tuple(names),
         replace(own, names=Names((*own.names.entries, *directions), own.names.groups)),
-        Names((*scene.inputs.entries, *names), scene.inputs.groups),
+        Names(("slow_slip", *scene.inputs.entries, *names), scene.inputs.groups),
         Modes((*scene.modes.pairs, *names.items())),
         tuple(name for name, modes in names.items() if modes == MODES_OF_ROW),
     )
