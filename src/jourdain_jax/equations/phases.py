@@ -148,7 +148,8 @@ STEADY = 1e-2  # numerics: greatest relative change of speed from a rebound to t
 
 def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tuple:
     """Return the impulses of an impact, by `impulse` at contact i or by Moreau's law at all contacts; which
-    contacts stick; and whether the law has a solution, whether it is decided, and whether there are several.
+    contacts stay closed, and which stick; and whether the law has a solution, whether it is decided, and
+    whether there are several.
     """
     restitution = jnp.stack([jnp.asarray(row.restitution) for row in at.rows])
     e_n = jnp.where(strikes & ~at.settles, restitution, 0.0)
@@ -156,8 +157,9 @@ def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tup
     target, mu = -e_n * at.w[:, 0], at.friction
     law = Law(at.found.G, w, target, mu, mu, touches, no, no, at.modes.direction)
     found = coulomb(law)
+    stays = (found.modes.closed > 0) & (target < LEAST_SLIP)  # by the law, not by its round-off
     if at.rows[i].impact == "moreau":
-        return found.P, found.modes.rolls, jnp.all(found.holds), True, found.several
+        return found.P, stays, found.modes.rolls, jnp.all(found.holds), True, found.several
     alone, borne = at.alone(i, w, found.modes)
     own = impulse(at.rows[i].impact, alone[:, :3], alone[:, 3], e_n[i], mu[i])
     modes = found.modes._replace(rolls=found.modes.rolls.at[i].set(jnp.where(own.slips, 0.0, 1.0)))
@@ -165,7 +167,8 @@ def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tup
     others = holds(law, P, modes).at[i].set(True)
     by_itself = strikes[i] & ~jnp.any(strikes.at[i].set(False))
     is_decided = by_itself & jnp.all(others) & jnp.all(jnp.isfinite(P))
-    return P, modes.rolls, own.exists, is_decided, found.several
+    stays = stays.at[i].set((w + at.found.G @ P.ravel())[3 * i] < LEAST_SLIP)
+    return P, stays, modes.rolls, own.exists, is_decided, found.several
 
 
 class After(NamedTuple):
@@ -188,7 +191,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     motion, rows = at.motion, at.found.rows
     hits, goes_on = jnp.any(strikes), jnp.any(begins)
     closed = (at.number != FLIES) | (hits & at.settles)
-    P, sticks, has_law, is_decided, several = _struck(at, closed | strikes, strikes, i)
+    P, stays, sticks, has_law, is_decided, several = _struck(at, closed | strikes, strikes, i)
     held = at.modes._replace(rolls=jnp.where(stops, 1.0, at.modes.rolls))
     stopping = responses(at.found.G, rows.w[:, None], held, at.friction)[:, 0]
     P = jnp.where(goes_on, 0.0, jnp.where(hits, P.ravel(), stopping))
@@ -197,7 +200,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     gained = 0.5 * P @ (rows.w + w.ravel())
     u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
 
-    touches = jnp.where(goes_on, closed, (closed | strikes) & (w[:, 0] < LEAST_SLIP))
+    touches = jnp.where(hits, stays, closed)
     slides = touches & jnp.where(goes_on, at.number == SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
     e = jnp.where((slides & ~goes_on)[:, None], unit(w[:, 1:]), at.modes.direction)
     numbers = jnp.where(touches, jnp.where(slides, SLIPS, ROLLS), FLIES)

@@ -293,9 +293,9 @@ def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Ar
 
     de/dt = n n.(dw_t/dt + k w_t/4v)/v,   v^4 = (e.w_t)^4 + s^4,   k = mu L_n n.G_tt n
 
-    n: e turned by a right angle. At speeds above s, v is |w_t|, and w_t stays along e. At lower speeds, friction
-    takes e to the direction with n.dw_t/dt = 0 at the rate k/v, and the term with k, of critical damping, takes
-    w_t to e.
+    n: e turned by a right angle. At speeds above s, v is |w_t|, and w_t stays along e. At lower speeds,
+    friction takes e to the direction with n.dw_t/dt = 0 at the rate k/v, and the term with k, of critical
+    damping, takes w_t to e.
     """
     e, L = contact_modes(scene, motion).direction, switching_forces(scene, motion, found)
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
