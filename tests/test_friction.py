@@ -124,16 +124,16 @@ class PulledBlock(Ball):
 
 
 def test_slip_that_begins_under_a_force_that_turns():
-    """Reference: integration by Radau from small times on (`|f|` reaches friction at t = 0)."""
+    """Reference: integration by Radau from small times on (`|f|` reaches friction at t = 0). A tolerance says
+    how slow a slip may turn as if it were faster, so loose ones need few steps.
+    """
     scene = PulledBlock(mass=1.0, friction=0.3, g=10.0)
-    motion = jj.simulate(scene, {"z": 0.0285}, t0=-0.1, ts=[0.5], rtol=1e-10, atol=1e-10)
-    x, y, vx, vy = (motion[name][0] for name in ("x", "y", "x_rate", "y_rate"))
-    assert_allclose(
-        [x, y, jnp.hypot(vx, vy), jnp.arctan2(vy, vx)],
-        [0.04826763, 0.03778878, 0.37065575, 0.86840719],
-        atol=6e-9,
-    )
-    assert motion.accepted + motion.rejected <= 600
+    for tolerance, most, off in ((1e-10, 600, 6e-9), (1e-6, 100, 1e-6), (1e-4, 40, 1e-4)):
+        motion = jj.simulate(scene, {"z": 0.0285}, t0=-0.1, ts=[0.5], rtol=tolerance, atol=tolerance)
+        x, y, vx, vy = (motion[name][0] for name in ("x", "y", "x_rate", "y_rate"))
+        found = [x, y, jnp.hypot(vx, vy), jnp.arctan2(vy, vx)]
+        assert_allclose(found, [0.04826763, 0.03778878, 0.37065575, 0.86840719], atol=off, rtol=0)
+        assert motion.accepted + motion.rejected <= most
 
 
 def test_bounces_and_rest():

@@ -57,7 +57,7 @@ from jourdain_jax.equations.contact_laws import (
     unit,
 )
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.rows import gaps_of, switching_rows
+from jourdain_jax.equations.rows import coefficients, gaps_of, switching_rows
 from jourdain_jax.equations.virtual_power import (
     ContactResponse,
     contact_modes,
@@ -100,9 +100,8 @@ class At:
         self.found = contact_response(scene, motion) if found is None else found
         if found is None:
             self.responses.append((motion.q.array, motion.u.array, motion.inputs.array, self.found))
-        self.rows, laws, _ = zip(*switching_rows(scene, motion).values(), strict=True)
-        self.friction = jnp.stack([law.sliding for law in laws])
-        self.static = jnp.stack([law.static for law in laws])
+        self.rows = tuple(switching_rows(scene, motion).values())
+        self.friction, self.static = coefficients(scene, motion)
         leans = [row.lean() for row in self.rows]
         self.above_flat = [None if x is None else x - FLAT_BELOW for x in leans]
         self.modes: Modes = contact_modes(scene, motion)

@@ -27,7 +27,7 @@ from jourdain_jax.calculus.reals import PerContact, PerRow, Scalar
 from jourdain_jax.equations.contact_laws import unit
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
-from jourdain_jax.scene.contact.contacts import Contact, Coulomb
+from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.loads import HeldRow, Load
 from jourdain_jax.scene.modes import SLIPS, switched, switching_of
@@ -91,7 +91,7 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     for name, contact in contacts_of(scene, motion.pose()).items():
         if contact.friction is not None:  # it may slip (`equations/phases.py`)
             continue
-        rows[f"{name} slip"] = slip_of(contact, motion)
+        rows[f"{name} slip"] = contact.slip(motion)
     for name, value in velocity_constraints_of(scene, motion).items():
         if name in rows:
             raise ValueError(
@@ -100,14 +100,6 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
             )
         rows[name] = value
     return rows
-
-
-def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
-    """Return the velocity (m/s) of a contact's body relative to the ground at its point, along both
-    tangents.
-    """
-    v, ground = motion[contact.body].velocity_at(contact.point), contact.plane.velocity_at(contact.point)
-    return contact.plane.tangents @ (v - ground)
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
@@ -185,16 +177,18 @@ class ContactRows(eqx.Module):
     drift: PerRow
 
 
-def switching_rows(
-    scene: Scene, motion: Motion
-) -> dict[str, tuple[Contact | HeldRow, Coulomb, Float[Array, "2"]]]:
-    """Return the contacts with friction and the constraints with a force limit, in the order of their modes,
-    each with its friction and its slip (m/s or rad/s).
+def switching_rows(scene: Scene, motion: Motion) -> dict[str, Contact | HeldRow]:
+    """Return the contacts with friction and the constraints with a force limit, in the order of their
+    modes.
     """
-    contacts = contacts_of(scene, motion.pose())
-    found = {name: (c, c.friction, slip_of(c, motion)) for name, c in contacts.items() if c.friction}
-    found |= {name: (row, row.friction, row.slip) for name, row in held_rows_of(scene, motion).items()}
+    found = contacts_of(scene, motion.pose()) | held_rows_of(scene, motion)
     return {name: found[name] for name in scene.switching.contacts}
+
+
+def coefficients(scene: Scene, motion: Motion) -> tuple[PerContact, PerContact]:
+    """Return the coefficients of sliding and of static friction of all rows that may switch."""
+    laws = [row.friction for row in switching_rows(scene, motion).values() if row.friction]
+    return jnp.stack([law.sliding for law in laws]), jnp.stack([law.static for law in laws])
 
 
 def gaps_of(scene: Scene, pose: Pose) -> PerContact:
@@ -207,7 +201,7 @@ def gaps_of(scene: Scene, pose: Pose) -> PerContact:
 def contact_speeds(scene: Scene, motion: Motion) -> PerRow:
     """Return the rates of the gaps, and the slip along both tangents, of all switching contacts, in m/s."""
     rates = rates_along(scene, motion, lambda pose: {"gaps": gaps_of(scene, pose)})["gaps"]
-    slips = [slip for *_, slip in switching_rows(scene, motion).values()]
+    slips = [row.slip(motion) for row in switching_rows(scene, motion).values()]
     return jnp.concatenate([rates[:, None], jnp.stack(slips)], axis=1).ravel()
 
 
@@ -234,7 +228,7 @@ def in_whole_scene(scene: Scene, motion: Motion) -> tuple[Scene, Motion, PerRow 
     if SLIPS not in dict(phase := scene.switching.phase).values():
         return scene, motion, 1.0
     contacts = contacts_of(scene, motion.pose())
-    slips = {name: unit(slip_of(contacts[name], motion)) for name, number in phase if number == SLIPS}
+    slips = {name: unit(contacts[name].slip(motion)) for name, number in phase if number == SLIPS}
     whole, numbers = switched(scene, switching_of(scene)), jnp.array([number for _, number in phase])
     q = jnp.concatenate([motion.q.array, *(slips.get(name, jnp.zeros(2)) for name, _ in phase)])
     inputs = jnp.concatenate([jnp.zeros(1), motion.inputs.array, numbers])
@@ -249,7 +243,7 @@ def contact_loads(
     limit give the forces `A' L` on the speeds.
     """
     loads, along, speeds = [], A[1::3], scene.speed_names.entries
-    for i, ((contact, *_), (normal, *tangential)) in enumerate(
+    for i, (contact, (normal, *tangential)) in enumerate(
         zip(switching_rows(scene, motion).values(), forces.reshape(-1, 3), strict=True)
     ):
         if isinstance(contact, HeldRow):

@@ -43,10 +43,10 @@ from jourdain_jax.equations.kinematics import (
 from jourdain_jax.equations.rows import (
     ConstraintRows,
     ContactRows,
+    coefficients,
     contact_loads,
     contact_rows,
     in_whole_scene,
-    switching_rows,
 )
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
@@ -268,17 +268,15 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
 
 
 def numbers_and_slots(scene: Scene, motion: Motion) -> tuple[PerContact, Float[Array, "contacts 2"]]:
-    """Return the number of the mode of each switching contact, and the two coordinates that it adds to the
-    state. They hold its direction of slip, or when its bounces end (`equations/phases.py`).
+    """Return the number of the mode of each switching contact, and its two coordinates: its direction of
+    slip, or when its bounces end (`equations/phases.py`).
     """
     count = len(scene.switching.contacts)
     return motion.inputs.array[-count:], motion.q.array[-2 * count :].reshape(-1, 2)
 
 
 def contact_modes(scene: Scene, motion: Motion) -> Modes:
-    """Return the modes of the switching contacts and their directions of slip, which are part of the state.
-    The direction is zero unless a contact slips.
-    """
+    """Return the modes of the switching contacts and their directions of slip, zero unless they slip."""
     number, slots = numbers_and_slots(scene, motion)
     one = jnp.ones_like(number)
     return Modes(
@@ -293,16 +291,14 @@ def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Ar
 
     de/dt = n n.(dw_t/dt + k w_t/4v)/v,   v^4 = (e.w_t)^4 + s^4,   k = mu L_n n.G_tt n
 
-    n: e turned by a right angle. At speeds above s, v is |w_t|, and w_t stays along e. At lower speeds,
-    friction takes e to the direction with n.dw_t/dt = 0 at the rate k/v, and the term with k, of critical
-    damping, takes w_t to e.
+    n: e turned by a right angle. Above s, v is |w_t|, and w_t stays along e. Below, friction takes e to the
+    direction with n.dw_t/dt = 0 at the rate k/v, and the term with k, of critical damping, takes w_t to e.
     """
     e, L = contact_modes(scene, motion).direction, switching_forces(scene, motion, found)
     n = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
     w, dw = (x.reshape(-1, 3)[:, 1:] for x in (found.rows.w, found.G @ L + found.b))
     own = [found.G[i : i + 2, i : i + 2] for i in range(1, len(L), 3)]
-    friction = jnp.stack([law.sliding for _, law, _ in switching_rows(scene, motion).values()])
-    k = friction * L[::3] * jnp.stack([n @ G @ n for n, G in zip(n, own, strict=True)])
+    k = coefficients(scene, motion)[0] * L[::3] * jnp.stack([n @ G @ n for n, G in zip(n, own, strict=True)])
     v = jnp.sqrt(jnp.sqrt(jnp.sum(e * w, axis=1) ** 4 + motion.inputs.slow_slip**4 + SLOW**4))[:, None]
     return (n * jnp.sum(n * (dw + k[:, None] * w / (4 * v)) / v, axis=1, keepdims=True)).ravel()
 
@@ -317,7 +313,7 @@ def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> PerCoordinate:
 
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> PerRow:
     """Return the forces of contacts in their modes, N."""
-    friction = jnp.stack([friction.sliding for _, friction, _ in switching_rows(scene, motion).values()])
+    friction, _ = coefficients(scene, motion)
     return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction)[:, 0]
 
 

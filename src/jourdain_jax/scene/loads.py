@@ -212,8 +212,7 @@ class HeldRow(eqx.Module):
         known = isinstance(friction, Coulomb)
         self.friction = friction if known else Coulomb(checked_real(friction, f"friction of {what}", ()))
 
-    @property
-    def slip(self) -> Float[Array, "2"]:
+    def slip(self, motion: Motion) -> Float[Array, "2"]:
         """Return the slip in the form of contacts, with two tangents; the second entry is zero."""
         return jnp.stack([self.w, self.restitution])
 

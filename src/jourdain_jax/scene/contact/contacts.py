@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypedDict, Unpack, get_args
 
 import equinox as eqx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import (
     Parameter,
@@ -27,7 +27,7 @@ from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.contact.grounds import Ground, Plane
 from jourdain_jax.scene.coordinates import Labels
-from jourdain_jax.scene.motion_state import BodyPose
+from jourdain_jax.scene.motion_state import BodyPose, Motion
 
 _HEIGHTS = ("coordinates", "row")
 IMPACTS = ("moreau", "newton", "poisson", "energetic")
@@ -132,6 +132,13 @@ class Contact(eqx.Module):
     def gap(self) -> Scalar:
         """Return the signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
+
+    def slip(self, motion: Motion) -> Float[Array, "2"]:
+        """Return the velocity (m/s) of the body relative to the ground at the contact point, in a `motion`,
+        along both tangents of the ground.
+        """
+        v, ground = motion[self.body].velocity_at(self.point), self.plane.velocity_at(self.point)
+        return self.plane.tangents @ (v - ground)
 
     def lean(self) -> Scalar | None:
         """Return `1 - (n.k)^2` of a disc or wheel with axle k, zero if it lies flat; None for
