@@ -991,7 +991,7 @@ class Braking(jj.Scene):
     def placed(self, q, mass, inertia, x, z, angle):
         """A body at a place of the frame, from the rear contact."""
         at = jnp.stack([q.x, 0.0, q.z]) + jj.rot_y(q.pitch) @ jnp.stack([x, 0.0, z - self.rear])
-        return jj.RigidBody(mass, jnp.stack([1.0, inertia, 1.0]), at, jj.rot_y(angle))
+        return jj.RigidBody(mass, inertia * jnp.ones(3), at, jj.rot_y(angle))
 
     def bodies(self, t, q):
         return {

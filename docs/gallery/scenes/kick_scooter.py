@@ -41,7 +41,7 @@ class KickScooter(jj.models.WhippleBicycle):
     zH: float = jj.parameter(-0.55, unit="m")
     mH: float = jj.parameter(2.0, unit="kg", positive=True)
     IHxx: float = jj.parameter(0.18, unit="kg m^2", non_negative=True)
-    IHyy: float = jj.parameter(0.17, unit="kg m^2", non_negative=True)
+    IHyy: float = jj.parameter(0.18, unit="kg m^2", non_negative=True)
     IHzz: float = jj.parameter(0.012, unit="kg m^2", non_negative=True)
     IHxz: float = jj.parameter(-0.03, unit="kg m^2")
 
