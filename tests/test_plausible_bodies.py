@@ -144,6 +144,10 @@ def test_a_check_names_grounds_and_bodies_and_passes_all_models():
     top = Top(moments=(1.0, 1.0, 3.0))
     assert "above the sum of the others" in jj.check(top).found["bodies"][0]
     assert "body `top`: a principal moment of inertia exceeds the sum of the other two" in str(jj.verify(top))
+    rounded = top.replace(moments=(1.0, 1.0, 2.06))
+    with pytest.warns(UserWarning, match="above the sum of the others"):
+        jj.build(rounded)
+    assert jj.simulate(rounded, {"turn_rate": 1.0}, ts=[0.1]).result == 0
     for use in (jj.build, jj.report):
         with pytest.raises(ValueError, match="above the sum of the others"):
             use(top)

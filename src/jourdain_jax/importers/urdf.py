@@ -120,7 +120,7 @@ def from_urdf(
 
     **Raises** ValueError, which names the link or joint, for an unreadable file, an unknown type of joint, a
     parent or child that does not exist, a loop, and repeated definitions; for a mass without inertia,
-    impossible moments of inertia (the largest above the sum of the others by more than 1 %), a joint that
+    impossible moments of inertia (the largest above the sum of the others by more than 5 %), a joint that
     moves no mass, and a joint with friction; and for contents that do not belong to a URDF, such as a
     misspelt attribute, `spring` of `dynamics`, `loop_joint`, or text in place of an attribute. A warning
     lists omitted elements without effect on the motion, such as `gazebo` and `transmission`.

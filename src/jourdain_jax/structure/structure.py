@@ -72,6 +72,7 @@ class Structure:
     rows_of_inputs: bool  # constraints depend on inputs; accelerations then depend on their rates
     chosen_by_user: bool
     kinks: Labels  # quantities that are not smooth, as sentences
+    odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
     odd_grounds: Labels  # grounds of contacts whose motion contradicts the stated one
     faults: Labels  # impossible bodies and planes, contradictory constraints; as sentences
     without_inertia: Labels  # a free motion without inertia, as a sentence
@@ -230,7 +231,7 @@ def _probed_structure(scene: Scene) -> Structure:
     on_rows = usable_states(scene, found, generic)
     numbers = at_index(found.numbers, on_rows)
     rough = kinks(scene, found.q[on_rows & generic], u)
-    grounds, faults = (sentences(scene, numbers, of) for of in ("grounds", "faults"))
+    grounds, bodies, faults = (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
     A = found.A * speed_scales(found.M)[:, None]
     usable = all_finite(A, axis=(1, 2)) & on_rows
     if not faults and not usable.any():
@@ -324,6 +325,7 @@ def _probed_structure(scene: Scene) -> Structure:
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user is not None,
         kinks=rough,
+        odd_bodies=bodies,
         odd_grounds=grounds,
         faults=faults,
         without_inertia=inert,
