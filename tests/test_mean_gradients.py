@@ -15,7 +15,7 @@ from jourdain_jax.studies import End, Happened, LogNormal, LogUniform, Normal, Q
 class Thrown(jj.Scene):
     """A particle thrown upwards: z = z0 + v t - g t^2 / 2; it may reach the ground."""
 
-    gravity: float = jj.parameter(9.0, unit="m/s^2")
+    gravity: float = jj.parameter(9.0)
     coordinates = jj.coordinates("z")
 
     def bodies(self, t, q):

@@ -20,10 +20,6 @@ from jourdain_jax.motion.simulate import set_up
 pytestmark = machine_code.needed
 
 
-def _motions(scene, starts=None, **options):
-    return [jj.simulate(scene, starts, backend=backend, **options) for backend in ("native", "xla")]
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -37,22 +33,12 @@ def _motions(scene, starts=None, **options):
     ],
 )
 def test_motions_are_those_of_xla_step_by_step(name, options):
-    ours, theirs = _motions(jj.models.MODELS[name](), **options)
-    assert (int(ours.accepted), int(ours.rejected), int(ours.result)) == (
-        int(theirs.accepted),
-        int(theirs.rejected),
-        int(theirs.result),
-    )
-    for a, b in (
-        (ours.q, theirs.q),
-        (ours.u, theirs.u),
-        (ours.q_end, theirs.q_end),
-        (ours.u_end, theirs.u_end),
-        (ours.t_end, theirs.t_end),
-    ):
-        assert_allclose(a, b, rtol=1e-10, atol=1e-10)
-    if ours.work is not None:
-        assert_allclose(ours.work, theirs.work, rtol=1e-10, atol=1e-10)
+    ours, theirs = (jj.simulate(jj.models.MODELS[name](), backend=by, **options) for by in ("native", "xla"))
+    for name in ("accepted", "rejected", "result"):
+        assert getattr(ours, name) == getattr(theirs, name)
+    names = ["q", "u", "q_end", "u_end", "t_end", *(["work"] if ours.work is not None else [])]
+    for name in names:
+        assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-10)
     assert_allclose(ours.energies().balance, theirs.energies().balance, rtol=1e-10, atol=1e-10)
     assert_allclose(ours.smallest_pivot, theirs.smallest_pivot, rtol=1e-9)
 
@@ -109,65 +95,57 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_thr
 
 
 def test_lanes_of_a_rollout_are_those_of_xla_step_by_step():
-    disc = jj.models.TiltingDisc()
     starts = {
         "lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]),
         "spin_rate": jnp.linspace(-4.0, 0.0, 9),
     }
-    ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], backend=backend) for backend in ("native", "xla"))
-    assert_array_equal(ours.result, theirs.result)
-    assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
-    assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
-    assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
+    by_both = [
+        jj.rollout(DISC, starts, ts=[0.5, 1.0], backend=backend).lanes for backend in ("native", "xla")
+    ]
+    for name in ("result", "accepted", "rejected"):
+        assert_array_equal(*(getattr(lanes, name) for lanes in by_both))
+    assert_allclose(*(lanes.q_end for lanes in by_both), rtol=1e-10, atol=1e-10)
     for name in ("q", "u", "u_end", "t_end", "smallest_pivot"):
-        of_ours, of_theirs = (
-            getattr(each.lanes, name)[each.result == results.SUCCESS] for each in (ours, theirs)
-        )
-        assert_allclose(of_ours, of_theirs, rtol=1e-10, atol=1e-10)
+        good = (getattr(lanes, name)[lanes.result == results.SUCCESS] for lanes in by_both)
+        assert_allclose(*good, rtol=1e-10, atol=1e-10)
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
-    disc, board = jj.models.TiltingDisc(), jj.models.Snakeboard()
-    assert set_up(disc).reason_against_machine_code == ""
-    assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was requested"
-    assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
-    assert (
-        "scalar program"
-        in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
-    )
-    assert set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code == ""
-    with_its_own_rule = set_up(board, inputs={"steer_torque": lambda t: jax.nn.softplus(t)})
-    assert "without scalar form" in with_its_own_rule.reason_against_machine_code
+    said = lambda scene=DISC, **options: set_up(scene, **options).reason_against_machine_code
+    assert said() == ""
+    assert said(backend="xla") == "another backend was requested"
+    assert "diffrax" in said(solver=diffrax.Heun())
+    assert "scalar program" in said(formulation=jj.Formulation(reduction="kkt"))
+    board = jj.models.Snakeboard()
+    assert said(board, inputs={"steer_torque": lambda t: jnp.sin(t)}) == ""
+    assert "without scalar form" in said(board, inputs={"steer_torque": lambda t: jax.nn.softplus(t)})
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
-    assert set_up(disc).reason_against_machine_code == "llvmlite is not installed"
+    assert said() == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")
     ffi.version.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
     with pytest.warns(UserWarning, match="this jaxlib has an unknown foreign function interface"):
-        assert "interface" in set_up(disc).reason_against_machine_code
+        assert "interface" in said()
     ffi.version.cache_clear()
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("API_MAJOR 0", "API_MAJOR 1"),
-        ("API_MINOR", "API_LESSER"),
-        ("void** args;", "void** args; int more;"),
-        ("int64_t* dims;", "int64_t* sizes;"),
-        ("(XLA_FFI_Stream_Get)", "(XLA_FFI_Lost)"),
-        ("(XLA_FFI_DeviceMemory_Free)", "(XLA_FFI_Lost)"),
-    ],
-)
-def test_an_interface_with_another_layout_is_not_known(old, new, tmp_path, monkeypatch):
+def test_an_interface_with_another_layout_is_not_known(tmp_path, monkeypatch):
     header = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h").read_text()
     assert ffi._stated_version() is not None
-    assert old in header
     changed = tmp_path / "xla/ffi/api/c_api.h"
     changed.parent.mkdir(parents=True)
-    changed.write_text(header.replace(old, new))
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
-    assert ffi._stated_version() is None
+    for old, new in {
+        "API_MAJOR 0": "API_MAJOR 1",
+        "API_MINOR": "API_LESSER",
+        "void** args;": "void** args; int more;",
+        "int64_t* dims;": "int64_t* sizes;",
+        "(XLA_FFI_Stream_Get)": "(XLA_FFI_Lost)",
+        "(XLA_FFI_DeviceMemory_Free)": "(XLA_FFI_Lost)",
+    }.items():
+        assert old in header
+        changed.write_text(header.replace(old, new))
+        assert ffi._stated_version() is None, old
 
 
 def test_a_scene_is_integrated_without_llvmlite(monkeypatch):

@@ -38,13 +38,13 @@ def _all_kept(*names):
 
 
 def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
-    assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
-    assert host.kept("a", "llvm 20", _never) == b"code"
+    (code,) = _all_kept("a")
+    assert host.kept("a", "llvm 20", _never) == code
     file = folder / "a.o"
     whole = file.read_bytes()
     for torn in (whole[:-1], b"", whole[:10]):
         file.write_bytes(torn)
-        assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
+        assert _all_kept("a") == [code]
         assert file.read_bytes() == whole
     assert [f.name for f in folder.iterdir()] == ["a.o"]
 
@@ -69,25 +69,22 @@ def test_files_that_are_exchanged_are_made_again(folder):
     """Also those of another kind, or what another version made: the digest at the beginning is that of name,
     maker and code.
     """
-    names = "abc"
-    right = _all_kept(*names)
-    whole = {name: (folder / f"{name}.o").read_bytes() for name in names}
-    for order in permutations(names):
-        for name, other in zip(names, order, strict=True):
-            (folder / f"{name}.o").write_bytes(whole[other])
-        assert _all_kept(*names) == right
+    right, files = _all_kept(*"abc"), [folder / f"{name}.o" for name in "abc"]
+    for order in permutations([file.read_bytes() for file in files]):
+        for file, content in zip(files, order, strict=True):
+            file.write_bytes(content)
+        assert _all_kept(*"abc") == right
     assert host.kept("a", "llvm 21", lambda: b"newer") == b"newer"
     assert host.kept("a", "llvm 20", lambda: b"older") == b"older"
 
 
 def test_every_byte_of_a_file_counts(folder):
-    (code,) = _all_kept("a")
-    file = folder / "a.o"
+    code, file = _all_kept("a"), folder / "a.o"
     whole = file.read_bytes()
-    for place in range(len(whole)):
-        for flipped in (whole[place] ^ 1, whole[place] ^ 128, 0, 255):
+    for place, byte in enumerate(whole):
+        for flipped in (byte ^ 1, byte ^ 128, 0, 255):
             file.write_bytes(whole[:place] + bytes([flipped]) + whole[place + 1 :])
-            assert _all_kept("a") == [code]
+            assert _all_kept("a") == code
     assert file.read_bytes() == whole
 
 
@@ -225,11 +222,8 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
     assert name() == usual
     names = [usual, name("another"), name(effort=1)]
     flat = SimpleNamespace(flatten=lambda: "-avx")
-    for what, value in (
-        ("get_host_cpu_name", lambda: "another"),
-        ("llvm_version_info", (1, 2, 3)),
-        ("get_host_cpu_features", lambda: flat),
-    ):
+    others = {"get_host_cpu_name": lambda: "another", "llvm_version_info": (1, 2, 3)}
+    for what, value in (others | {"get_host_cpu_features": lambda: flat}).items():
         with monkeypatch.context() as patch:
             patch.setattr(host.llvm, what, value)
             names.append(name())

@@ -57,12 +57,11 @@ def motion(x, k, a, b, aside=0.0, wall=9.0, **options):
 
 @both_modes
 def test_motions_and_derivatives_are_those_of_the_closed_form(derivative):
-    X0 = {name: jnp.asarray(value) for name, value in X.items()}
-    found = motion(**X0)
+    found = motion(**X)
     assert found.reduction.endswith("machine code")
-    assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
-    slopes = jax.jit(lambda x: derivative(lambda x: motion(**x)["x"])(x))(X0)
-    for name, expected in jax.jit(jax.jacfwd(lambda x: position(TS, **x)))(X0).items():
+    assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
+    slopes = jax.jit(derivative(lambda x: motion(**x)["x"]))(X)
+    for name, expected in jax.jit(jax.jacfwd(lambda x: position(TS, **x)))(X).items():
         assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
 
 
@@ -70,32 +69,26 @@ def test_lanes_have_functions_of_their_own():
     a = jnp.linspace(-1.0, 1.0, 11)
     found = jax.jit(jax.vmap(lambda a: motion(**X | {"a": a})["x"]))(a)
     assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
-    lanes = jj.rollout(
-        Pushed(),
-        {"x": jnp.linspace(0.1, 0.5, 5)},
-        ts=TS,
-        inputs={"force": lambda t: 0.8 * jnp.sin(1.3 * t)},
-        **TIGHT,
-    ).lanes
+    x, force = jnp.linspace(0.1, 0.5, 5), {"force": lambda t: 0.8 * jnp.sin(1.3 * t)}
+    lanes = jj.rollout(Pushed(), {"x": x}, ts=TS, inputs=force, **TIGHT).lanes
     assert lanes.reduction.endswith("machine code")
-    expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(jnp.linspace(0.1, 0.5, 5))
+    expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(x)
     assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
 
 
 @both_modes
 def test_functions_samples_and_numbers_stand_side_by_side(derivative):
     record = jj.Sampled([0.0, 1.0, 3.0], [0.0, 0.6, 0.2])
-    for aside in (record, jnp.asarray(0.7)):
+    for aside in (record, 0.7):
         found = motion(**X, aside=aside)
         assert found.reduction.endswith("machine code")
         assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
     assert_allclose(found["y"], 0.35 * TS**2, rtol=0, atol=1e-10)
-    slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f)["y"])(f))(0.7)
+    slope = jax.jit(derivative(lambda f: motion(**X, aside=f)["y"]))(0.7)
     assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
-    of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record)["x"])(a))(0.8)
-    assert_allclose(
-        of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9
-    )
+    of_record = jax.jit(derivative(lambda a: motion(**X | {"a": a}, aside=record)["x"]))(0.8)
+    expected = np.subtract(*(position(TS, **X | {"a": a}) for a in (1.0, 0.0)))
+    assert_allclose(of_record, expected, rtol=0, atol=1e-9)
 
 
 @both_modes
@@ -111,7 +104,7 @@ def test_an_event_may_depend_on_a_function_of_time(derivative):
     assert found.result == results.EVENT
     assert abs(gap(found.t_end, 0.8)) < 1e-9
     by_t, by_a = jax.grad(gap, (0, 1))(found.t_end, 0.8)
-    slope = jax.jit(lambda a: derivative(lambda a: end(a).t_end)(a))(0.8)
+    slope = jax.jit(derivative(lambda a: end(a).t_end))(0.8)
     assert_allclose(slope, -by_a / by_t, rtol=0, atol=1e-7)
 
 
@@ -136,9 +129,7 @@ def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
         """A scene of which nothing is known yet."""
 
     def end(_):
-        return np.asarray(
-            jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"]
-        )
+        return jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"]
 
     with ThreadPoolExecutor(2) as threads:
         assert_array_equal(*threads.map(end, range(2)))

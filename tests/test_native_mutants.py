@@ -376,8 +376,8 @@ def a_hessian_with_respect_to_times():
 
 
 def reverse_mode_with_respect_to_times():
-    found = jax.jit(jax.grad(lambda ts: WEIGHTS @ pushed(**START, ts=ts).ys.q[:, 0]))(jnp.asarray(TIMES))
-    rates = jax.vmap(jax.grad(lambda t: pushed_position(t, **START)))(jnp.asarray(TIMES))
+    found = jax.jit(jax.grad(lambda ts: WEIGHTS @ pushed(**START, ts=ts).ys.q[:, 0]))(TIMES)
+    rates = jax.vmap(jax.grad(lambda t: pushed_position(t, **START)))(TIMES)
     assert_allclose(found, WEIGHTS * rates, rtol=0, atol=1e-7, err_msg="derivative with respect to times")
 
 

@@ -30,52 +30,30 @@ def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
     def both(load, push, slope, along, turn, angular):
         made = {"load": load, "push": push, "slope": slope}
         level, free = Cart(**made), CartOnRows(**made)
-        o, i, radius = jnp.zeros(()), jnp.ones(()), level.radius
-        balls = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), 3)
-        q, q_free = (
-            jnp.concatenate([jnp.zeros(3), balls]),
-            jnp.concatenate([jnp.stack([o, o, radius, i, o, o, o]), balls]),
-        )
-        turns = []
-        for k in range(3):
-            x, y = level.places[k]
-            v = along + turn * jnp.stack([-y, x])
-            turns += [-v[1] / radius, v[0] / radius, angular[k]]
-        ball_u = jnp.stack(turns)
-        u, u_free = (
-            jnp.concatenate([along, turn[None], ball_u]),
-            jnp.concatenate([along, jnp.stack([o, o, o, turn]), ball_u]),
-        )
-        first, second = (
-            contact_forces(s, 0.0, x, y, jj.accelerations(s, 0.0, x, y))
-            for s, x, y in ((level, q, u), (free, q_free, u_free))
-        )
-        press = [jnp.stack([found[f"ball{k}"].normal for k in range(3)]) for found in (first, second)]
-        slide = [jnp.stack([found[f"ball{k}"].tangential for k in range(3)]) for found in (first, second)]
-        known = jnp.stack([found[f"ball{k}"].determined for found in (first, second) for k in range(3)])
-        return (
-            press[0] - press[1],
-            slide[0] - slide[1],
-            press[1],
-            known,
-            velocity_residual(free, 0.0, q_free, u_free),
-        )
+        o, radius, balls = jnp.zeros(3), level.radius, jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), 3)
+        v = along + turn * jnp.array(level.places)[:, ::-1] * jnp.array([-1.0, 1.0])
+        ball_u = jnp.stack([-v[:, 1] / radius, v[:, 0] / radius, angular], axis=1).ravel()
+        found = []
+        for scene, q, u in (
+            (level, [o, balls], [along, turn, ball_u]),
+            (free, [o[:2], radius, jnp.ones(1), o, balls], [along, o, turn, ball_u]),
+        ):
+            q, u = (jnp.concatenate([jnp.atleast_1d(x) for x in parts]) for parts in (q, u))
+            given = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))
+            names = "normal", "tangential", "determined"
+            found.append([jnp.stack([getattr(given[f"ball{k}"], name) for k in range(3)]) for name in names])
+        return *found, velocity_residual(free, 0.0, q, u)
 
-    n = 6
-    inputs = (
-        random.normal(size=(n, 3)) * 0.1,
-        random.normal(size=(n, 3)) * 5,
-        random.uniform(-0.3, 0.3, n),
-        random.normal(size=(n, 2)),
-    )
-    inputs += (random.normal(size=n), random.normal(size=(n, 3)))
-    press, slide, expected, known, residual = both(*(jnp.asarray(x) for x in inputs))
+    drawn = [size * random.normal(size=(6, n)) for size, n in ((0.1, 3), (5.0, 3), (1.0, 2), (1.0, 3))]
+    drawn = [*drawn[:2], random.uniform(-0.3, 0.3, 6), drawn[2], random.normal(size=6), drawn[3]]
+    ours, (expected, right, known), residual = both(*map(jnp.asarray, drawn))
+    press, slide = ours[0] - expected, ours[1] - right
     assert np.max(np.abs(residual)) <= tolerance("round_off")
-    assert (
-        np.max(np.abs(press)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10
-    )  # ten: a system of 18 unknowns
-    assert np.max(np.abs(slide)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10
+    close = tolerance("round_off") * np.max(np.abs(expected)) * 10  # ten: a system of 18 unknowns
+    assert np.max(np.abs(press)) <= close
+    assert np.max(np.abs(slide)) <= close
     assert np.all(known)
+    assert np.all(ours[2])
     assert np.ptp(expected) > 1.0
 
 

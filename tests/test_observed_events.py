@@ -23,19 +23,12 @@ SCENE, SIGMA = Stopped(mass=2.0, stiffness=5.0, damping=0.0), 0.003  # s
 STOP = float(np.pi / 2 * np.sqrt(SCENE.mass / SCENE.stiffness))  # s
 
 
-def run(x0=0.3, events=None, values=None, **more) -> jj.Experiment:
+def run(x0=0.3, events=None, values=None, end=1.0) -> jj.Experiment:
     """A run of which no more than its event is known, unless values are given at ten times a second."""
-    ts = np.array([1.0]) if values is None else 0.1 * np.arange(1, len(values) + 1)
+    ts = np.array([end]) if values is None else 0.1 * np.arange(1, len(values) + 1)
     events = {"buffer": (STOP + 0.002, SIGMA)} if events is None else events
-    return jj.Experiment(
-        ts,
-        {} if values is None else {"x": values},
-        0.005,
-        start={"x": x0, "x_rate": 0.0},
-        t0=0.0,
-        events=events,
-        **more,
-    )
+    seen, start = {} if values is None else {"x": values}, {"x": x0, "x_rate": 0.0}
+    return jj.Experiment(ts, seen, 0.005, start=start, t0=0.0, events=events)
 
 
 def fit(*runs, **options) -> Fit:
@@ -48,18 +41,9 @@ def test_an_observed_time_tells_a_parameter_as_in_closed_form():
     mass = 5.0 * (2 * (STOP + 0.002) / np.pi) ** 2
     assert_allclose(found["mass"].value, mass, rtol=1e-7)
     assert_allclose(found["mass"].standard_error, 2 * mass * SIGMA / (STOP + 0.002), rtol=1e-6)
-    # samples may end long before it
-    early = jj.Experiment(
-        np.array([0.05, 0.1]),
-        {},
-        {},
-        start={"x": 0.3, "x_rate": 0.0},
-        t0=0.0,
-        events={"buffer": (STOP + 0.002, SIGMA)},
-    )
-    assert_allclose(fit(early)["mass"].value, mass, rtol=1e-7)
-    # to less than a round-off, whatever the amplitude
-    assert_allclose(fit(run(0.6))["mass"].value, mass, rtol=1e-7)
+    # samples may end long before it; to less than a round-off, whatever the amplitude
+    for other in (run(end=0.05), run(0.6)):
+        assert_allclose(fit(other)["mass"].value, mass, rtol=1e-7)
 
 
 def test_runs_with_and_without_an_event_are_fitted_together_and_samples_after_it_do_not_count():
@@ -104,9 +88,9 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
 
 
 def test_a_motion_that_does_not_meet_the_event_is_named():
-    other = fit(run(values=np.full(9, 0.3), events={"far": (0.9, SIGMA)}))
+    far = run(events={"far": (0.9, SIGMA)})
+    other = fit(far)
     assert not other.converged
-    assert "the motion of run 0 does not reach `far` before 4 times the observed time" in "".join(
-        other.warnings
-    )
-    assert log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf
+    said = "the motion of run 0 does not reach `far` before 4 times the observed time"
+    assert said in "".join(other.warnings)
+    assert log_likelihood(SCENE, far) == -np.inf

@@ -223,25 +223,6 @@ def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_dens
             jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y)))(y[0])
 
 
-START = {"heading": 0.4, "x_rate": 0.8, "heading_rate": 0.9}
-OPTIONS = {"ts": np.array([0.5, 1.0]), "rtol": 1e-9, "atol": 1e-9}
-
-
-@pytest.mark.parametrize("name", ["iteration", "network", "callback"])
-def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
-    scene = LAWS[name][0]
-    program, dense = (jj.simulate(scene, START, backend=backend, **OPTIONS) for backend in ("auto", "dense"))
-    assert "lowered" in program.reduction
-    assert_allclose(program.q, dense.q, atol=1e-8)
-    assert_allclose(program.work, dense.work, atol=1e-9)
-    lanes = jj.rollout(scene, START | {"heading_rate": np.linspace(0.9, 1.2, 11)}, **OPTIONS)
-    assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
-    assert_allclose(
-        lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8
-    )
-    assert np.all(np.diff(lanes.lanes.q_end[:, 2]) != 0)
-
-
 class OnCam(jj.Scene):
     """A bead whose height is a table of where it is."""
 

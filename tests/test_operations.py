@@ -114,6 +114,19 @@ def test_powers_have_the_derivatives_of_jax(base, exponent):
         assert_allclose(found[finite], expected[finite], rtol=1e-13, atol=1e-13)
 
 
+RAMP = lambda x: (
+    jnp.maximum(x, 0.0) - jnp.minimum(1.0, jnp.maximum(-x, 0.0)) + jnp.log1p(jnp.exp(-jnp.abs(x)))
+)
+OF_ONE = [(RAMP, 0.0), (lambda x: jnp.power(x + 2.0, x), 0.0)]
+
+
+@pytest.mark.parametrize(("f", "at"), [*OF_ONE, (jax.lax.logistic, -800.0), (jax.lax.logistic, 800.0)])
+def test_derivatives_where_branches_meet_and_of_saturated_functions_are_those_of_jax(f, at):
+    first = slice(2 if f is RAMP else 3)  # of the ramp, JAX halves second derivatives in a way of its own
+    found, expected = to_second_order(lambda x: f(x[0]), (at,)), by_jax(lambda x: f(x[0]), (at,))
+    assert_allclose(found[first], expected[first], atol=1e-15)
+
+
 @pytest.mark.parametrize("largest", [jnp.max, jnp.min])
 @pytest.mark.parametrize(
     "point", [(1.0, 1.0, 1.0), (2.0, 1.0, 2.0), (1.0, 2.0, 2.0), (3.0, 1.0, 2.0), (0.1, 0.1, 0.1)]

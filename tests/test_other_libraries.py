@@ -38,7 +38,7 @@ def test_numpyro_draws_a_posterior_that_arviz_trusts():
 
 def test_optax_finds_gravity_through_a_rollout():
     found = page("optax", "optax")
-    assert float(found["gravity"]) == pytest.approx(3.7, abs=2e-3)
+    assert found["gravity"] == pytest.approx(3.7, abs=2e-3)
 
 
 def test_environments_of_gymnasium_agree_and_policies_keep_bicycles_upright():

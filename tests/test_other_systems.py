@@ -112,12 +112,9 @@ def test_processors_of_arm_have_vectors_and_fused_products_also_where_llvm_says_
 def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(monkeypatch):
     monkeypatch.setattr(host, "lanes", lambda: 2)
     monkeypatch.setattr(host, "threads", lambda: 3)
-    asked = []
-    monkeypatch.setattr(
-        value_kernels,
-        "write_rows",
-        lambda *given, write=value_kernels.write_rows: asked.append(given[0].threads) or write(*given),
-    )
+    asked, write = [], value_kernels.write_rows
+    counted = lambda *given: asked.append(given[0].threads) or write(*given)
+    monkeypatch.setattr(value_kernels, "write_rows", counted)
     graph = Graph()
     x = graph.input("x", True)
     sine = value_kernels.nodes_called(graph, [graph.call("sin", x)], [x])
@@ -209,14 +206,11 @@ def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkey
 
 
 def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
-    asked = []
+    asked, usual = [], os.open
     monkeypatch.setattr(os, "O_BINARY", 0x8000, raising=False)
     monkeypatch.setitem(sys.modules, "fcntl", None)
-    monkeypatch.setattr(
-        os,
-        "open",
-        lambda path, flags, *mode, open=os.open: asked.append(flags) or open(path, flags & ~0x8000, *mode),
-    )
+    seen = lambda path, flags, *mode: asked.append(flags) or usual(path, flags & ~0x8000, *mode)
+    monkeypatch.setattr(os, "open", seen)
     runpy.run_path(whole_files.__file__)["write_whole"](tmp_path / "a", b"1\n2")
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
@@ -241,16 +235,14 @@ def test_a_study_takes_an_empty_folder_also_where_a_folder_cannot_take_the_place
 
 def _read_as_text(tree: ast.AST) -> Iterator[ast.Call]:
     for call in ast.walk(tree):
-        if not isinstance(call, ast.Call):
-            continue
-        name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-        of_os = isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "os"
-        modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
-        own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of `calculus/files.py`
-        if (name in ("read_text", "write_text") and not own) or (
-            name == "open" and not of_os and not any("b" in mode for mode in modes)
-        ):
-            yield call
+        if isinstance(call, ast.Call):
+            # `read_text` alone is that of `calculus/files.py`
+            name = ast.unparse(call.func).rpartition(".")[1:]
+            binary = any("b" in str(getattr(x, "value", "")) for x in call.args[:2])
+            if name in ((".", "read_text"), (".", "write_text")) or (
+                name[1] == "open" and ast.unparse(call.func) != "os.open" and not binary
+            ):
+                yield call
 
 
 def test_every_text_file_has_an_encoding_that_does_not_depend_on_the_system():
@@ -262,11 +254,7 @@ def test_every_text_file_has_an_encoding_that_does_not_depend_on_the_system():
         for call in _read_as_text(ast.parse(text))
     ]
     assert len(calls) > 4
-    assert not [
-        (name, call.lineno)
-        for name, call in calls
-        if "encoding" not in [keyword.arg for keyword in call.keywords]
-    ]
+    assert not [(name, call.lineno) for name, call in calls if "encoding=" not in ast.unparse(call)]
 
 
 # studies

@@ -93,16 +93,6 @@ def test_the_force_that_keeps_the_speed_lies_along_the_velocity():
 def test_the_particle_of_constant_speed_turns_downwards():
     run = isokinetic_particle.RUN
     scene = IsokineticParticle(speed=run["speed"], gravity=run["gravity"])
-    assert (
-        end_error(
-            scene,
-            {"x_rate": run["speed"]},
-            isokinetic_particle.motion,
-            run,
-            x="x",
-            z="y",
-            x_rate="vx",
-            z_rate="vy",
-        )
-        <= CLOSED_FORM
-    )
+    names = {"x": "x", "z": "y", "x_rate": "vx", "z_rate": "vy"}
+    start = {"x_rate": run["speed"]}
+    assert end_error(scene, start, isokinetic_particle.motion, run, **names) <= CLOSED_FORM

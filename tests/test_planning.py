@@ -13,23 +13,19 @@ import jourdain_jax as jj
 from jourdain_jax.identification import planned_information
 from jourdain_jax.studies import Normal
 
-TS = np.linspace(0.1, 3.0, 16)
+TS, CART = np.linspace(0.1, 3.0, 16), Cart(damping=0.0)
 
 
-def plan(x=0.3, force=0.0, unknown=()):
-    return jj.Experiment(
-        TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"push": force}, t0=0.0
-    )
+def plan(x=0.3, force=0.0, unknown=(), values=TS):
+    more = {"start": {"x": x}, "unknown_start": unknown, "inputs": {"push": force}, "t0": 0.0}
+    return jj.Experiment(TS, {"x": values}, 0.01, **more)
 
 
 def test_planned_covariance_is_that_of_a_fit():
     unknown = {"x": jj.Estimate(prior=Normal(0.3, 0.005))}
-    values = {"x": jj.simulate(Cart(damping=0.0), {"x": 0.3}, t0=0.0, ts=TS, inputs={"push": 0.4})["x"]}
-    run = jj.Experiment(
-        TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"push": 0.4}, t0=0.0
-    )
-    fit = jj.fit(Cart(damping=0.0), run, ("mass", "stiffness"))
-    found = planned_information(Cart(damping=0.0), plan(force=0.4, unknown=unknown), ("mass", "stiffness"))
+    values = jj.simulate(CART, {"x": 0.3}, t0=0.0, ts=TS, inputs={"push": 0.4})["x"]
+    fit = jj.fit(CART, plan(0.3, 0.4, unknown, values), ("mass", "stiffness"))
+    found = planned_information(CART, plan(0.3, 0.4, unknown), ("mass", "stiffness"))
     assert found.labels == fit.labels == ("mass", "stiffness", "run 0: x")
     assert_allclose(found.covariance, fit.covariance, rtol=1e-5)
     assert_allclose(found.log_det(), -np.linalg.slogdet(fit.covariance)[1], rtol=1e-6)
@@ -38,18 +34,18 @@ def test_planned_covariance_is_that_of_a_fit():
 
 
 def test_what_a_plan_will_not_tell_is_named():
-    found = planned_information(Cart(damping=0.0), plan(), ("mass", "stiffness"))
+    found = planned_information(CART, plan(), ("mass", "stiffness"))
     (sentence,) = found.not_identifiable
     assert "are not determined separately" in sentence
     assert sentence in str(found)
     assert [row.split()[-1] for row in str(found).splitlines()[2:4]] == ["-", "-"]
-    assert not planned_information(Cart(damping=0.0), plan(), "mass").not_identifiable
+    assert not planned_information(CART, plan(), "mass").not_identifiable
 
 
 def test_a_plan_is_one_program_which_serves_other_numbers(compilations):
-    told = lambda mass, x: float(
-        planned_information(Cart(mass=mass, damping=0.0), plan(x), ("stiffness",)).log_det()
-    )
+    def told(mass, x):
+        return float(planned_information(CART.replace(mass=mass), plan(x), ("stiffness",)).log_det())
+
     first = told(1.5, 0.2)
     assert len(compilations) <= 8
     compilations.clear()
@@ -64,7 +60,7 @@ def stated(x):
 
 
 def of_stiffness(x):
-    return planned_information(Cart(damping=0.0), plan(x), ("stiffness",)).matrix[0, 0]
+    return planned_information(CART, plan(x), ("stiffness",)).matrix[0, 0]
 
 
 def test_information_has_a_closed_form():
@@ -75,9 +71,8 @@ def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     knots = jnp.linspace(0.0, 3.0, 5)
 
     def told(values):
-        return planned_information(
-            Cart(damping=0.0), plan(0.1, jj.Sampled(knots, values)), ("mass", "stiffness"), backend="xla"
-        ).log_det()
+        planned = plan(0.1, jj.Sampled(knots, values))
+        return planned_information(CART, planned, ("mass", "stiffness"), backend="xla").log_det()
 
     values, way = jnp.array([0.0, 0.5, -0.3, 0.8, 0.1]), jnp.array([0.3, -1.0, 0.5, 0.2, 0.0])
     _, slope = jax.jit(lambda v, w: jax.jvp(told, (v,), (w,)))(values, way)

@@ -32,12 +32,9 @@ def test_rods_plates_and_bodies_with_a_moment_about_one_axis_can_be(moments):
 
 def test_traced_parameters_are_not_judged_by_the_numbers_that_stand_in_for_them():
     # the stand-in of `product` is 0.1, that of a scene without defaults could be anything
-    slope = jax.grad(
-        lambda p: jnp.sum(
-            jj.simulate(Top(moments=(0.05, 0.05, 0.05), product=p), {"turn_rate": 1.0}, t1=0.1).q_end
-        )
-    )(0.01)
-    assert np.isfinite(slope)
+    made = lambda product: Top(moments=(0.05, 0.05, 0.05), product=product)
+    end = lambda product: jnp.sum(jj.simulate(made(product), {"turn_rate": 1.0}, t1=0.1).q_end)
+    assert np.isfinite(jax.grad(end)(0.01))
 
 
 class BallOnPlate(jj.Scene):
@@ -132,11 +129,8 @@ class OnLift(OnSledge):
         return made | {"ball": jj.RigidBody.ball(1.0, 0.1, position=at, orientation=jj.rot_y(q.roll))}
 
     def contacts(self, pose):
-        return {
-            "back": jj.ball_contact(
-                pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0, 0.0, pose.q.rise]))
-            )
-        }
+        ground = self.ground(pose.q, jnp.stack([0.0, 0.0, pose.q.rise]))
+        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=ground)}
 
 
 def test_a_check_names_grounds_and_bodies_and_passes_all_models():

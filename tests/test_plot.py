@@ -36,26 +36,23 @@ def overlap(figure, *artists):
     return any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[k + 1 :])
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "size"),
-    [
-        ("heading", "deg", 180 / np.pi),
-        ("heading_rate", "rpm", 30 / np.pi),
-        ("x", "cm", 100.0),
-        ("x_rate", "km/h", 3.6),
-        ("energy", "mJ", 1000.0),
-    ],
-)
-def test_values_are_drawn_in_the_units_that_are_asked_for(motions, name, unit, size):
-    figure, axes = jj.plot(motions[0], name, units={name: unit, "t": "ms"})
+UNITS = {"heading": ("deg", 180 / np.pi), "heading_rate": ("rpm", 30 / np.pi), "x": ("cm", 100.0)}
+UNITS |= {"x_rate": ("km/h", 3.6), "energy": ("mJ", 1000.0)}
+
+
+def test_values_are_drawn_in_the_units_that_are_asked_for(motions):
+    units = {name: unit for name, (unit, _) in UNITS.items()}
+    figure, axes = jj.plot(motions[0], *units, units=units | {"t": "ms"})
     energies = motions[0].energies()
-    expected = energies.kinetic + energies.potential if name == "energy" else motions[0][name]
-    (line,) = axes[0].lines
-    assert_allclose(line.get_xydata(), np.stack([1000 * TS, size * expected], axis=1), rtol=1e-12, atol=1e-12)
-    symbol = {"x": "$x$", "x_rate": r"$\dot{x}$"}.get(name, name)
-    assert axes[0].get_ylabel() == f"{symbol} in {unit}"
-    assert axes[0].get_xlabel() == "$t$ in ms"
-    assert figure is axes[0].figure
+    for axis, (name, (unit, size)) in zip(axes, UNITS.items(), strict=True):
+        expected = energies.kinetic + energies.potential if name == "energy" else motions[0][name]
+        (line,) = axis.lines
+        assert_allclose(line.get_xdata(), 1000 * TS, rtol=1e-12, atol=1e-12)
+        assert_allclose(line.get_ydata(), size * expected, rtol=1e-12, atol=1e-12)
+        symbol = {"x": "$x$", "x_rate": r"$\dot{x}$"}.get(name, name)
+        assert axis.get_ylabel() == f"{symbol} in {unit}"
+        assert axis.figure is figure
+    assert axes[-1].get_xlabel() == "$t$ in ms"
 
 
 def test_the_energy_of_a_damped_motion_is_what_it_has_left():

@@ -132,32 +132,25 @@ def test_a_linkage_of_one_freedom_a_loop_has_its_rank_and_freedoms(name):
     assert found.degrees_of_freedom == len(scene.coordinate_names) - rank
 
 
-def bounds(scene) -> np.ndarray:
-    """Lowest and highest values of the coordinates of its domain."""
-    return np.array([scene.domain.get(name, (-3.2, 3.2)) for name in scene.coordinate_names.entries]).T
+def assert_on_rows_and_in_domain(scene, times, q):
+    closures = [position_residual(scene, *state) for state in zip(times[:8], q[:8], strict=True)]
+    assert np.max(np.abs(closures)) < 1e-11
+    low, high = np.array([scene.domain.get(name, (-3.2, 3.2)) for name in scene.coordinate_names.entries]).T
+    assert np.max(np.maximum(low - q, q - high) / (high - low)) <= 0.1
 
 
 @pytest.mark.parametrize("name", LINKAGES)
 def test_probed_configurations_are_on_the_rows_and_in_the_domain(name):
     scene, _ = LINKAGES[name]
-    found, (low, high) = structure_of(scene), bounds(scene)
-    closures = [
-        np.max(np.abs(position_residual(scene, t, q)))
-        for t, q in zip(found.times[:8], found.coordinates[:8], strict=True)
-    ]
-    assert max(closures) < 1e-11
-    outside = np.maximum(low - found.coordinates, found.coordinates - high) / (high - low)
+    found = structure_of(scene)
     assert found.random >= 4
-    assert np.max(outside) <= 0.1
+    assert_on_rows_and_in_domain(scene, found.times, found.coordinates)
 
 
 @pytest.mark.parametrize("name", ["Bennett", "parallelogram", "windows"])
 def test_sampled_states_are_on_the_rows_and_in_the_domain(name):
     scene, _ = LINKAGES[name]
-    t, q, _ = jj.sample_states(scene, 5, seed=3)
-    low, high = bounds(scene)
-    assert max(np.max(np.abs(position_residual(scene, *state))) for state in zip(t, q, strict=True)) < 1e-11
-    assert np.all((q >= low - 0.1 * (high - low)) & (q <= high + 0.1 * (high - low)))
+    assert_on_rows_and_in_domain(scene, *jj.sample_states(scene, 5, seed=3)[:2])
 
 
 def _swinging():

@@ -86,13 +86,18 @@ def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
     }
 
 
+def rim(scene, q, u):
+    """The force of the contact of this name."""
+    return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+
+
 def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_turn():
     # B4: multipliers -m w_heading R w_spin (sin heading, -cos heading); N = m g
     scene = VerticalDisc(mass=1.4, radius=0.7)
     q, u, _ = scene.named(
         heading=0.4, heading_rate=2.0, roll_rate=1.5, x_rate=1.05 * jnp.cos(0.4), y_rate=1.05 * jnp.sin(0.4)
     )
-    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    contact = rim(scene, q, u)
     centripetal = 1.4 * 2.0 * 0.7 * 1.5
     assert jnp.allclose(contact.normal, 1.4 * 9.81, rtol=tolerance("round_off"))
     assert jnp.allclose(
@@ -109,8 +114,7 @@ def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_t
     "scene", [VerticalDisc(gravity=-9.81), small.DiscWithHeightRow(gravity=-9.81)], ids=["Newton", "row"]
 )
 def test_a_contact_that_would_have_to_pull_is_flagged(scene):
-    q, u, _ = scene.named()
-    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    contact = rim(scene, *scene.named()[:2])
     assert contact.pulls
     assert contact.normal < 0
     assert jnp.isinf(contact.friction_needed)
@@ -137,8 +141,7 @@ def test_a_contact_without_any_load_bears_nothing_and_is_honest(scene):
 def test_a_contact_that_presses_nowhere_and_is_pushed_sideways_needs_infinite_friction():
     # no gravity, a turn: centripetal force m w_heading R w_roll without a normal force
     scene = VerticalDisc(mass=1.4, radius=0.7, gravity=0.0)
-    q, u, _ = scene.named(heading_rate=2.0, roll_rate=1.5, x_rate=1.05)
-    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    contact = rim(scene, *scene.named(heading_rate=2.0, roll_rate=1.5, x_rate=1.05)[:2])
     assert jnp.allclose(
         contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=tolerance("round_off")
     )
@@ -149,7 +152,6 @@ def test_a_contact_that_presses_nowhere_and_is_pushed_sideways_needs_infinite_fr
 def test_friction_needed_has_a_finite_gradient_where_nothing_slides():
     def friction(radius):
         scene = VerticalDisc(radius=radius)
-        q, u, _ = scene.named()
-        return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"].friction_needed
+        return rim(scene, *scene.named()[:2]).friction_needed
 
     assert jnp.isfinite(jax.grad(friction)(0.7))

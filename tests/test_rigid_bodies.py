@@ -9,30 +9,27 @@ from tolerances import relative_error, tolerance
 import jourdain_jax as jj
 from jourdain_jax.models import FreeRigidBody, Suslov
 
-MOMENTS = dict(zip(("i1", "i2", "i3"), free_rigid_body.RUN["inertia"], strict=True))
+RUN = free_rigid_body.RUN
+MOMENTS = dict(zip(("i1", "i2", "i3"), RUN["inertia"], strict=True))
 TOP, HELD = FreeRigidBody(**MOMENTS), Suslov()
+
+
+def turned(start, end, count, scene=TOP):
+    return jj.simulate(scene, start, ts=jnp.linspace(0.0, end, count), rtol=1e-12, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
 def free():
     """20 s, turning and flying off."""
-    start = {
-        "attitude_omega": jnp.asarray(free_rigid_body.RUN["w0"]),
-        "x": 1.0,
-        "x_rate": 0.3,
-        "y_rate": -0.1,
-        "z_rate": 0.2,
-    }
-    return jj.simulate(
-        TOP, start, ts=jnp.linspace(0.0, free_rigid_body.RUN["t_end"], 21), rtol=1e-12, atol=1e-12
-    )
+    flying = {"x": 1.0, "x_rate": 0.3, "y_rate": -0.1, "z_rate": 0.2}
+    return turned(flying | {"attitude_omega": jnp.asarray(RUN["w0"])}, RUN["t_end"], 21)
 
 
 def test_a_free_body_turns_by_elliptic_functions(free):
-    expected = free_rigid_body.motion(free.ts, **free_rigid_body.RUN)
+    expected = free_rigid_body.motion(free.ts, **RUN)
     assert relative_error(free["attitude_omega"], expected) <= tolerance("closed_form")
-    turned = free_rigid_body.rotation(free_rigid_body.attitude(np.asarray(free.ts), **free_rigid_body.RUN))
-    assert relative_error(free_rigid_body.rotation(free["attitude"]), turned) <= tolerance("closed_form")
+    attitudes = free["attitude"], free_rigid_body.attitude(np.asarray(free.ts), **RUN)
+    assert relative_error(*map(free_rigid_body.rotation, attitudes)) <= tolerance("closed_form")
 
 
 def test_its_mass_centre_flies_straight(free):
@@ -45,7 +42,7 @@ def test_momentum_and_angular_momentum_and_energy_are_conserved(free):
     assert relative_error(energy, jnp.full_like(energy, energy[0])) <= tolerance("closed_form")
     for k in (5, 20):
         first, later = (TOP.invariants(jj.motion_at(TOP, free.ts[i], free.q[i], free.u[i])) for i in (0, k))
-        size = float(np.linalg.norm(np.array(free_rigid_body.RUN["w0"]) * free_rigid_body.RUN["inertia"]))
+        size = np.linalg.norm(np.array(RUN["w0"]) * RUN["inertia"])
         for name, value in first.items():
             assert abs(later[name] - value) <= tolerance("closed_form") * size, name
 
@@ -54,22 +51,20 @@ def test_turning_about_the_middle_axis_is_steady_until_disturbed():
     q, u, _ = TOP.named(attitude_omega=jnp.array([0.0, 1.0, 0.0]))
     assert jnp.max(jnp.abs(jj.accelerations(TOP, 0.0, q, u).udot)) == 0
     nearly = (0.01, 1.0, 0.0)
-    kicked = jj.simulate(
-        TOP, {"attitude_omega": jnp.array(nearly)}, ts=jnp.linspace(0.0, 15.0, 7), rtol=1e-12, atol=1e-12
-    )
-    expected = free_rigid_body.motion(kicked.ts, inertia=free_rigid_body.RUN["inertia"], w0=nearly)
+    kicked = turned({"attitude_omega": jnp.array(nearly)}, 15.0, 7)
+    expected = free_rigid_body.motion(kicked.ts, inertia=RUN["inertia"], w0=nearly)
     assert np.min(expected[:, 1]) < -0.9  # turned over
     assert relative_error(kicked["attitude_omega"], expected) <= tolerance("closed_form")
 
 
 def test_suslov_motion_ends_in_a_turn_about_the_second_axis():
-    motion = jj.simulate(HELD, ts=jnp.linspace(0.0, suslov.RUN["t_end"], 11), rtol=1e-12, atol=1e-12)
+    motion = turned(None, suslov.RUN["t_end"], 11, HELD)
     times = np.asarray(motion.ts)
     expected = suslov.motion(times, **suslov.RUN)
     for name, key in (("attitude_omega_x", "w1"), ("attitude_omega_y", "w2"), ("attitude_omega_z", "w3")):
         assert relative_error(motion[name], expected[key], 1.0) <= tolerance("closed_form"), name
-    turned = suslov.attitude(times, **suslov.RUN)
-    assert relative_error(motion["attitude"], turned) <= tolerance("closed_form")
+    attitude = suslov.attitude(times, **suslov.RUN)
+    assert relative_error(motion["attitude"], attitude) <= tolerance("closed_form")
 
 
 def test_suslov_multiplier_is_the_torque_about_the_third_axis():

@@ -73,21 +73,13 @@ def test_a_quadruped_on_a_free_base_is_lowered():
 
 def test_a_tree_whose_tensors_are_traced_first_is_lowered_too():
     scene = jj.from_urdf(tree(2, 1, 2, lambda draw: BONE))()
-    jax.jit(lambda I: jj.simulate(scene.replace(l01_inertia=I), START, **SPAN).q_end)(jnp.asarray(BONE))
+    jax.jit(lambda I: jj.simulate(scene.replace(l01_inertia=I), START, **SPAN).q_end)(BONE)
     assert jj.lower(scene).operations > 0
-    lanes = jj.rollout(
-        scene, START, **SPAN, parameters={"l01_inertia": jnp.stack([BONE, 1.2 * BONE])}, progress=False
-    )
-    for k, scale in enumerate((1.0, 1.2)):
-        assert_allclose(
-            lanes["j01"][k],
-            jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"],
-            rtol=1e-9,
-        )
-
-
-def bone():
-    return jnp.asarray(BONE)
+    tensors = np.stack([BONE, 1.2 * BONE])
+    lanes = jj.rollout(scene, START, **SPAN, parameters={"l01_inertia": tensors})
+    for found, tensor in zip(lanes["j01"], tensors, strict=True):
+        alone = jj.simulate(scene.replace(l01_inertia=tensor), START, **SPAN)
+        assert_allclose(found, alone["j01"], rtol=1e-9)
 
 
 class Spinning(jj.Scene):
@@ -99,20 +91,10 @@ class Spinning(jj.Scene):
     domain = {"lean": (-1.0, 1.0), "spin": (-1.0, 1.0)}
 
     def bodies(self, t, q):
-        I = (
-            bone()
-            .at[0, 1]
-            .set(self.across)
-            .at[1, 0]
-            .set(self.across)
-            .at[0, 2]
-            .set(self.beside)
-            .at[2, 0]
-            .set(self.beside)
-        )
-        return {
-            "body": jj.RigidBody(1.0, I, jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin))
-        }
+        a, b = self.across, self.beside
+        I = jnp.stack([jnp.stack(row) for row in ([3e-5, a, b], [a, 4e-4, 0.0], [b, 0.0, 4.1e-4])])
+        turned = jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin)
+        return {"body": jj.RigidBody(1.0, I, jnp.zeros(3), turned)}
 
 
 def test_products_of_inertia_that_are_parameters_of_their_own_are_varied_within_what_bodies_have():
@@ -123,19 +105,18 @@ JOINT = '<joint name="j" type="continuous"><parent link="base"/><child link="arm
 PENDULUM = '<robot name="p"><link name="base"/><link name="arm">{}</link>' + JOINT + "</robot>"
 
 
+def pendulum(tensor):
+    return PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), tensor))
+
+
 @pytest.mark.parametrize("noise", [2e-35, -1e-33, 1e-22])
 def test_round_off_in_a_tensor_of_zeros_is_no_moment(noise):
-    arm = jj.from_urdf(
-        PENDULUM.format(
-            inertial(
-                1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]])
-            )
-        )
-    )()
-    point = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.zeros((3, 3)))))()
-    assert_array_equal(
-        jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end
-    )
+    tensor = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    ends = [
+        jj.simulate(jj.from_urdf(pendulum(size * tensor))(), {"j": 0.3}, **SPAN).q_end
+        for size in (noise, 0.0)
+    ]
+    assert_array_equal(*ends)
 
 
 class Point(jj.Scene):
@@ -151,10 +132,8 @@ def test_round_off_in_a_tensor_of_a_scene_is_no_negative_moment():
     motion = jj.simulate(Point(), {"q_rate": 1.0}, **SPAN)
     assert motion.result == 0
     assert_allclose(motion.q_end, [0.2], rtol=1e-9)
-    lanes = jj.rollout(
-        Point(), {"q_rate": 1.0}, **SPAN, parameters={"noise": jnp.array([2e-35, -1e-33])}, progress=False
-    )
-    assert not np.any(np.asarray(lanes.result))
+    noise = {"noise": jnp.array([2e-35, -1e-33])}
+    assert not np.any(jj.rollout(Point(), {"q_rate": 1.0}, **SPAN, parameters=noise).result)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +162,7 @@ def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(momen
         '<joint name="f" type="fixed"><parent link="arm"/><child link="plate"/><origin xyz="0 0 0.1" rpy="0.3'
         ' 0.2 0.1"/></joint></robot>'
     )
-    arm = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), 0.01 * np.eye(3)))
+    arm = pendulum(0.01 * np.eye(3))
     assert jj.from_urdf(arm.replace("</robot>", plate + joint))().plate_mass == 0.1
     with pytest.raises(ValueError, match=r"link `arm`, with links fixed to it, has principal moments"):
         jj.from_urdf(
@@ -194,7 +173,7 @@ def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(momen
 
 
 def test_moments_that_no_body_has_are_read_on_purpose_and_replaced():
-    text = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag((1.0, 1.0, 3.0))))
+    text = pendulum(np.diag((1.0, 1.0, 3.0)))
     arm = jj.from_urdf(text, ignore="inertia")()
     assert_array_equal(arm.arm_inertia, (1.0, 1.0, 3.0))
     with pytest.raises(ValueError, match="above the sum of the others"):
@@ -204,7 +183,7 @@ def test_moments_that_no_body_has_are_read_on_purpose_and_replaced():
 
 def _pendulum(form, moments):
     if form == "urdf":
-        return jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag(moments))))
+        return jj.from_urdf(pendulum(np.diag(moments)))
     stated = f'<inertial pos="0 0.3 0" mass="1" diaginertia="{moments[0]} {moments[1]} {moments[2]}"/>'
     return jj.from_mjcf(
         '<mujoco><worldbody><body name="arm"><joint name="j" axis="1 0'

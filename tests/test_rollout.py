@@ -23,13 +23,8 @@ def sleighs():
     turning = np.array([0.9, 0.5, np.nan, -0.3, 0.2, 0.7, 0.1])
     offset = np.array([0.25, 0.2, 0.25, 0.3, 0.1, np.nan, 0.2])
     starts = {"x_rate": -0.6, "heading_rate": turning}
-    return (
-        turning,
-        offset,
-        jj.rollout(
-            ChaplyginSleigh(), starts, parameters={"offset": offset}, chunk=3, progress=False, **OPTIONS
-        ),
-    )
+    options = OPTIONS | {"parameters": {"offset": offset}, "chunk": 3, "progress": False}
+    return turning, offset, jj.rollout(ChaplyginSleigh(), starts, **options)
 
 
 def test_every_lane_is_the_motion_it_would_be_alone(sleighs):
@@ -38,7 +33,7 @@ def test_every_lane_is_the_motion_it_would_be_alone(sleighs):
         scene = ChaplyginSleigh(offset=offset[i])
         alone = jj.simulate(scene, {"x_rate": -0.6, "heading_rate": turning[i]}, **OPTIONS)
         assert_allclose(lanes.lane(i).q, alone.q, atol=1e-9)
-        assert float(lanes.lane(i).scene.offset) == offset[i]
+        assert lanes.lane(i).scene.offset == offset[i]
 
 
 def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
@@ -57,18 +52,15 @@ def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
 def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
     """The first saved time of the one is not that of the other."""
     starts = [jj.start(ChaplyginSleigh(), t0=t0, x_rate=1.0) for t0 in (0.0, 1.0)]
-    lanes = jj.rollout(
-        ChaplyginSleigh(), jax.tree.map(lambda *x: jnp.stack(x), *starts), t1=2.0, progress=False
-    )
+    lanes = jj.rollout(ChaplyginSleigh(), jax.tree.map(lambda *x: jnp.stack(x), *starts), t1=2.0)
     with pytest.raises(ValueError, match="lanes have different saved times"):
         lanes.quantiles("x")
     assert "<img" not in lanes._repr_html_()
 
 
 def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
-    lanes = jj.rollout(
-        ChaplyginSleigh(), parameters={"mass": np.array([1.0, -1.0, np.nan, 0.0])}, progress=False, **OPTIONS
-    )
+    masses = {"mass": np.array([1.0, -1.0, np.nan, 0.0])}
+    lanes = jj.rollout(ChaplyginSleigh(), parameters=masses, **OPTIONS)
     assert lanes.result.tolist() == [results.SUCCESS, *[results.BAD_PARAMETER] * 3]
     assert "wrong sign (`mass`): lanes 1, 2, 3" in str(lanes)
     assert lanes.lane(1).message.endswith("(`mass`); check where it was computed")
@@ -100,15 +92,12 @@ def test_another_tolerance_longest_step_or_end_is_no_other_program(compilations)
 def test_states_made_by_hand_are_starts_of_lanes():
     sleigh = ChaplyginSleigh()
     made = [jj.start(sleigh, x_rate=speed, heading_rate=0.3) for speed in (0.4, 0.6)]
-    starts = eqx.tree_at(
-        lambda s: s.guess, jax.tree.map(lambda *x: jnp.stack(x), *made), jnp.zeros(())
-    )  # what `jj.State` has by default
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *made)
+    starts = eqx.tree_at(lambda s: s.guess, stacked, jnp.zeros(()))  # what `jj.State` has by default
     options = {"ts": jnp.array([0.2]), "formulation": jj.Formulation(stabilisation=None)}
     lanes = jj.rollout(sleigh, starts, **options)
-    for k, state in enumerate(made):
-        assert_allclose(
-            lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12
-        )
+    alone = [jj.simulate(sleigh, state, **options).q_end for state in made]
+    assert_allclose(lanes.lanes.q_end, alone, rtol=1e-9, atol=1e-12)
 
 
 def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():

@@ -37,32 +37,22 @@ def test_rows_of_a_large_scene_have_the_derivatives_of_the_scenes_own():
         assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
-def of_skate(y_rate):
-    return jj.simulate(
-        jj.models.Skate(), {"heading": 0.0, "x_rate": 1.0, "y_rate": y_rate, "heading_rate": 0.1}, t1=0.5
-    )
+def of_skate(y_rate, run=jj.simulate):
+    start = {"heading": 0.0, "x_rate": 1.0, "y_rate": y_rate, "heading_rate": 0.1}
+    return run(jj.models.Skate(), start, t1=0.5)
 
 
 def test_values_that_contradict_each_other_get_a_result_code_where_they_are_traced():
-    seen = jax.jit(
-        lambda y_rate: (lambda motion: (motion.result, motion.u[0], motion.moved_u))(of_skate(y_rate))
-    )
-    assert int(seen(0.5)[0]) == results.INCONSISTENT_START
+    seen = jax.jit(of_skate)
+    assert seen(0.5).result == results.INCONSISTENT_START
     with pytest.raises(ValueError, match="violates constraint `edge`"):
         of_skate(0.5)
-    for result, u, moved in (
-        seen(1e-7),
-        (lambda motion: (motion.result, motion.u[0], motion.moved_u))(of_skate(1e-7)),
-    ):
-        assert int(result) == results.SUCCESS
-        assert_allclose(u, [1.0, 0.0, 0.1], atol=1e-15)  # what passes for round-off moves
-        assert_allclose(moved, 1e-7, rtol=1e-6)
-    lanes = jj.rollout(
-        jj.models.Skate(),
-        {"heading": 0.0, "x_rate": 1.0, "y_rate": jnp.array([0.0, 0.5, 1e-7]), "heading_rate": 0.1},
-        t1=0.5,
-    )
-    assert np.asarray(lanes.result).tolist() == [results.SUCCESS, results.INCONSISTENT_START, results.SUCCESS]
+    for motion in (seen(1e-7), of_skate(1e-7)):
+        assert motion.result == results.SUCCESS
+        assert_allclose(motion.u[0], [1.0, 0.0, 0.1], atol=1e-15)  # what passes for round-off moves
+        assert_allclose(motion.moved_u, 1e-7, rtol=1e-6)
+    lanes = of_skate(jnp.array([0.0, 0.5, 1e-7]), jj.rollout)
+    assert lanes.result.tolist() == [results.SUCCESS, results.INCONSISTENT_START, results.SUCCESS]
 
 
 def test_a_scene_whose_parameters_are_judged_by_an_unknown_operation_moves_without_a_program_of_rows(

@@ -54,19 +54,15 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
 def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_state(solver):
     every = [{"t0": 0.0, "t1": times["ts"][-1]} | times for times in (WRONG | SHUFFLED | RIGHT).values()]
     stacked = {name: jnp.array([times[name] for times in every]) for name in ("ts", "t0", "t1")}
-    lanes = jax.jit(
-        jax.vmap(
-            lambda times: jj.simulate(SPRING, START, rtol=1e-7, atol=1e-7, solver=solver, work=False, **times)
-        )
-    )(stacked)
+    options = {"rtol": 1e-7, "atol": 1e-7, "solver": solver, "work": False}
+    lanes = jax.jit(jax.vmap(lambda times: jj.simulate(SPRING, START, **options, **times)))(stacked)
     wrong = len(WRONG) + len(SHUFFLED)
     assert lanes.result.tolist() == [results.BAD_TIMES] * wrong + [results.SUCCESS] * len(RIGHT)
     assert np.isnan(lanes.q[:wrong]).all()
     assert np.isnan(lanes.u[:wrong]).all()
     assert_array_equal(lanes.ts, stacked["ts"])
-    assert_allclose(
-        lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5
-    )
+    right = np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))
+    assert_allclose(lanes.q[wrong:, :, 0], right[wrong:], atol=1e-5)
     assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
 
 
@@ -90,8 +86,7 @@ def test_even_times_of_any_span_go_together():
     @jax.jit
     @jax.vmap
     def code(t0, t1):
-        return jj.simulate(
-            SPRING.replace(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000
-        ).result
+        options = {"t0": t0, "t1": t1, "rtol": 1e-5, "atol": 1e-5, "max_steps": 1000}
+        return jj.simulate(SPRING.replace(stiffness=0.0), START, **options).result
 
-    assert not np.any(np.asarray(code(*jnp.asarray(ends.T))) == results.BAD_TIMES)
+    assert not np.any(code(*ends.T) == results.BAD_TIMES)

@@ -62,82 +62,45 @@ def test_a_large_number_elsewhere_hides_nothing():
     assert judged(f) == [True, False, True]
 
 
-class Sleigh(jj.Scene):
-    """A knife edge with a row nonlinear in the speeds or not, a drive and a load; lengths, masses and times
-    in any units.
+def sleigh(kind, metre, kilogram, second):
+    """A sleigh with a row nonlinear in the speeds or not, a drive and a load, in any units: one metre,
+    kilogram and second are given in those of the scene.
     """
+    speed = metre / second
 
-    coordinates = jj.coordinates("x y heading")
-    units = (1.0, 1.0, 1.0)  # one metre, kilogram and second, in the units of the scene
-    kind = "affine"
+    class Sleigh(jj.Scene):
+        coordinates = jj.coordinates("x y heading")
+        domain = {"x": (-metre, metre), "y": (-metre, metre), "heading_rate": (-1.0 / second, 1.0 / second)}
+        domain |= {"x_rate": (-speed, speed), "y_rate": (-speed, speed)}
 
-    @property
-    def domain(self):
-        metre, _, second = self.units
-        speed = metre / second
-        return {
-            "x": (-metre, metre),
-            "y": (-metre, metre),
-            "x_rate": (-speed, speed),
-            "y_rate": (-speed, speed),
-            "heading_rate": (-1.0 / second, 1.0 / second),
-        }
+        def bodies(self, t, q):
+            ahead, inertia = 0.1 * metre * jj.rot_z(q.heading)[:, 0], 0.05 * kilogram * metre**2 * jnp.ones(3)
+            at = jnp.stack([q.x, q.y, 0.0]) + ahead
+            return {"sleigh": jj.RigidBody(2.0 * kilogram, inertia, at, jj.rot_z(q.heading))}
 
-    def bodies(self, t, q):
-        metre, kilogram, _ = self.units
-        position = jnp.stack(
-            [q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0]
-        )
-        return {
-            "sleigh": jj.RigidBody(
-                2.0 * kilogram, 0.05 * kilogram * metre**2 * jnp.eye(3), position, jj.rot_z(q.heading)
-            )
-        }
+        def velocity_constraints(self, motion):
+            u, sideways = motion.u, jj.rot_z(motion.q.heading)[:2, 1]
+            turned = 1e-2 * u.heading_rate**2 * second**2 * speed
+            drift = {"affine": 1e-3 * speed, "homogeneous": 0.0, "nonlinear": turned}
+            return {"edge": sideways @ u.array[:2] + drift[kind]}
 
-    def velocity_constraints(self, motion):
-        metre, _, second = self.units
-        speed = metre / second
-        across = -jnp.sin(motion.q.heading) * motion.u.x_rate + jnp.cos(motion.q.heading) * motion.u.y_rate
-        drift = {
-            "affine": 1e-3 * speed,
-            "homogeneous": 0.0,
-            "nonlinear": 1e-2 * motion.u.heading_rate**2 * second**2 * speed,
-        }[self.kind]
-        return {"edge": across + drift}
+        def loads(self, motion):
+            torque = 0.1 * kilogram * speed**2 * jnp.sin(motion.q.heading)
+            return (jj.generalized_force(motion, heading_rate=torque),)
 
-    def loads(self, motion):
-        metre, kilogram, second = self.units
-        return (
-            jj.Load(
-                generalized={
-                    "heading_rate": 0.1 * kilogram * metre**2 / second**2 * jnp.sin(motion.q.heading)
-                }
-            ),
-        )
+    return Sleigh()
 
 
-UNITS = {
-    "m, kg, s": (1.0, 1.0, 1.0),
-    "mm, t, s": (1e3, 1e-3, 1.0),
-    "nm, kg, s": (1e9, 1.0, 1.0),
-    "km, t, h": (1e-3, 1e-3, 1 / 3600),
-}
+# m kg s; mm t s; nm kg s; km t h
+UNITS = [(1.0, 1.0, 1.0), (1e3, 1e-3, 1.0), (1e9, 1.0, 1.0), (1e-3, 1e-3, 1 / 3600)]
 
 
 @pytest.mark.parametrize("kind", ["affine", "homogeneous", "nonlinear"])
-def test_units_decide_nothing(kind, monkeypatch):
-    monkeypatch.setattr(Sleigh, "kind", kind)
-    said = {}
-    for name, units in UNITS.items():
-        monkeypatch.setattr(Sleigh, "units", units)
-        structure, program = jj.structure_of(Sleigh()), jj.lower(Sleigh())
-        said[name] = (
-            structure.rank,
-            structure.affine,
-            structure.homogeneous,
-            structure.independent,
-            structure.redundant_rows,
-            program.held,
-        )
-        assert said[name][1:3] == (kind != "nonlinear", kind != "affine")
-    assert len(set(said.values())) == 1, said
+def test_units_decide_nothing(kind):
+    said = set()
+    for units in UNITS:
+        scene = sleigh(kind, *units)
+        found = jj.structure_of(scene)
+        assert (found.affine, found.homogeneous) == (kind != "nonlinear", kind != "affine")
+        said.add((found.rank, found.independent, found.redundant_rows, jj.lower(scene).held))
+    assert len(said) == 1, said

@@ -57,7 +57,7 @@ def test_a_helper_of_a_base_class_may_be_overridden():
         def forces(self, motion):
             return jj.generalized_force(motion, x_rate=-3.0)
 
-    assert float(jj.accelerations(Pulled(), 0.0, jnp.zeros(2), jnp.zeros(2)).udot[0]) == -3.0
+    assert jj.accelerations(Pulled(), 0.0, jnp.zeros(2), jnp.zeros(2)).udot[0] == -3.0
 
 
 def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alone():
@@ -90,7 +90,7 @@ def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alon
         def potentials(cls):
             return cls()
 
-    assert float(Own().load) == 2.0
+    assert Own().load == 2.0
 
 
 def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
@@ -98,7 +98,7 @@ def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
         def __init__(self, weight):
             self.mass = weight / 9.81
 
-    assert float(Heavy(weight=9.81).mass) == 1.0
+    assert Heavy(weight=9.81).mass == 1.0
     with pytest.raises(ValueError, match=r"scene `Heavy` has no parameter `wait`; .*Valid names: `weight`"):
         Heavy(wait=9.81)
 

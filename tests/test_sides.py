@@ -219,7 +219,9 @@ def test_an_event_where_several_conditions_meet_is_met(kind):
     slope, value = with_value(jax.grad, time)(0.7)
     assert_allclose(value, 0.7, rtol=0, atol=1e-9)
     # the value jumps below zero where a relation changes
-    assert_array_equal([slope, jax.jit(jax.jacfwd(time))(0.7)], np.nan)
+    assert np.isnan(slope)
+    if kind == "one condition":
+        assert np.isnan(jax.jit(jax.jacfwd(time))(0.7))
 
 
 @pytest.mark.parametrize("kind", ["sets in at a place", "a place and a time", "floor"])
@@ -237,14 +239,11 @@ def test_on_arrays_values_and_slopes_are_the_same(kind):
 def test_lanes_are_in_modes_of_their_own():
     law, exact = LAWS["sets in at a place"]
     a = np.linspace(-0.5, 3.0, 30)
-    found = jj.rollout(
-        Bead(law=law), {"x_rate": 1.1}, parameters={"a": a}, ts=[SPAN], rtol=1e-12, atol=1e-12, progress=False
-    ).lanes
-    met = (a > 0) & (a < 2.2)
-    free, held = 2.2, 2.2 - 0.5 * SPAN**2 / 2
-    assert_allclose(
-        found.q_end[:, 0], np.where(met, exact(a, 0.5, 1.1), np.where(a > 1, free, held)), atol=1e-12
-    )
+    options = {"parameters": {"a": a}, "ts": [SPAN], "rtol": 1e-12, "atol": 1e-12}
+    found = jj.rollout(Bead(law=law), {"x_rate": 1.1}, **options).lanes
+    met, free, held = (a > 0) & (a < 2.2), 2.2, 2.2 - 0.5 * SPAN**2 / 2
+    right = np.where(met, exact(a, 0.5, 1.1), np.where(a > 1, free, held))
+    assert_allclose(found.q_end[:, 0], right, atol=1e-12)
     assert_array_equal(found.crossings, met)
 
 
@@ -253,47 +252,40 @@ def test_a_step_ends_at_a_relation_at_little_cost():
     assert int(found.accepted) + int(found.rejected) <= 40
 
 
-STARTS = {
-    "passes": ({"x": 0.7, "x_rate": 1.0}, 0.7 + 2.0 - 0.5 * 2),
-    "passes down": ({"x": 0.7, "x_rate": -1.0}, -1.3),
-    "beside": ({"x": 0.7 - 1e-9, "x_rate": 1.0}, 0.7 + 2.0 - 0.5 * 2),
-}
-
-
-@pytest.mark.parametrize("kind", STARTS)
-def test_a_motion_that_begins_at_a_relation_takes_the_side_to_which_it_goes(kind):
-    start, exact = STARTS[kind]
-    assert_allclose(end(Bead(law=LAWS["sets in at a place"][0]), start).q_end[0], exact, atol=3e-9)
+def test_a_motion_that_begins_at_a_relation_takes_the_side_to_which_it_goes():
+    for x, rate, exact in ((0.7, 1.0, 1.7), (0.7, -1.0, -1.3), (0.7 - 1e-9, 1.0, 1.7)):
+        found = end(Bead(law=LAWS["sets in at a place"][0]), {"x": x, "x_rate": rate})
+        assert_allclose(found.q_end[0], exact, atol=3e-9)
 
 
 def test_what_rests_at_a_relation_rests_whatever_round_off_says():
     drag = Bead(law=lambda s, t, x, v: -v * jnp.abs(v) - jnp.sin(x) + jnp.where(x > 0, -x, 0.0))
-    still = end(drag, {"x": 0.0, "x_rate": 0.0})
+    still = end(drag, {"x_rate": 0.0})
     assert (still.result, still.crossings, float(still.q_end[0])) == (results.SUCCESS, 0, 0.0)
-    brakes = end(Bead(law=lambda s, t, x, v: jnp.where(v > 0, -s.k, 0.0)), ts=[4.0])  # and stays there
-    assert brakes.result == results.SUCCESS
-    assert_allclose([brakes.q_end[0], brakes.u_end[0]], [1.0, 0.0], atol=1e-12)
-    goes_on = end(
-        Bead(law=lambda s, t, x, v: jnp.where(v > 0, -s.k, 0.0) + jnp.where(t > 3, 1.0, 0.0)), ts=[4.0]
-    )
-    assert_allclose([goes_on.q_end[0], goes_on.u_end[0]], [1.25, 0.5], atol=1e-7)
+    # what brakes stays there, or goes on
+    later = Bead(law=lambda s, t, x, v: jnp.where(v > 0, -0.5, 0.0) + jnp.where(t > s.a, s.k, 0.0))
+    for k, close, right in ((0.0, 1e-12, [1.0, 0.0]), (1.0, 1e-7, [1.25, 0.5])):
+        found = end(later.replace(a=3.0, k=k), ts=[4.0])
+        assert found.result == results.SUCCESS
+        assert_allclose([found.q_end[0], found.u_end[0]], right, atol=close)
 
 
 @pytest.mark.parametrize("start", [0.0, 1.0])
 def test_dry_friction_at_rest_is_said_to_stick(start):
-    found = end(Bead(law=lambda s, t, x, v: 0.3 - s.k * jnp.sign(v)), {"x_rate": start}, ts=[10.0])
+    pulled = lambda a, **options: end(
+        Bead(a, law=lambda s, t, x, v: s.a - s.k * jnp.sign(v)), {"x_rate": start}, **options
+    )
+    found = pulled(0.3, ts=[10.0])
     assert found.result == results.STICKS
     assert "friction=" in found.message
     assert "the force along `x_rate`" in found.message
     assert_allclose(found.t_end, 5 * start, atol=1e-6)
-    assert (
-        end(Bead(law=lambda s, t, x, v: 0.7 - s.k * jnp.sign(v)), {"x_rate": start}).result == results.SUCCESS
-    )
+    assert pulled(0.7).result == results.SUCCESS
 
 
 def test_relations_within_events_and_inputs():
-    stops = Bead(event=lambda s, motion: jnp.where(motion.q.x > s.a, s.a + s.k - motion.q.x, 1.0))
-    t = lambda a: end(stops.replace(a=a), {"x_rate": 2.0}).t_end
+    stops = lambda s, motion: jnp.where(motion.q.x > s.a, s.a + s.k - motion.q.x, 1.0)
+    t = lambda a: end(Bead(a, event=stops), {"x_rate": 2.0}).t_end
     assert_allclose(with_value(jax.grad, t)(0.7), [0.5, 0.6], atol=1e-12)
     bounces = Bead(
         law=LAWS["sets in at a place"][0],

@@ -3,6 +3,7 @@ supported mode.
 """
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,11 +51,11 @@ def test_an_event_stops_the_motion_at_the_closed_form_time():
     assert "`landed`" in motion.message
     assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
     assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
-    assert float(motion.end.t) == float(motion.t_end)
+    assert motion.end.t == float(motion.t_end)
     assert_allclose(motion.end.q, motion.q_end, atol=1e-12)
-    later = np.asarray(motion.ts) > float(motion.t_end)
-    assert np.all(np.isnan(np.asarray(motion.q)[later]))
-    assert np.all(np.isfinite(np.asarray(motion.q)[~later]))
+    later = motion.ts > float(motion.t_end)
+    assert np.all(np.isnan(motion.q[later]))
+    assert np.all(np.isfinite(motion.q[~later]))
 
 
 def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so():
@@ -97,48 +98,30 @@ def test_geometric_rows_hold_after_every_step_by_projection_and_drift_without():
 
 def test_a_start_off_the_constraints_is_moved_onto_them_and_the_motion_says_how_far():
     scene = ChaplyginSleigh()
-    off = jj.start(scene, **scene.example)
-    pushed = jj.State(off.t, off.q, off.u + 1e-3, off.moved_q, off.moved_u, off.residual, off.names)
-    motion = jj.simulate(scene, pushed, t1=0.5)
-    assert 1e-5 < float(motion.moved_u) < 2e-3
+    on = jj.start(scene, **scene.example)
+    motion = jj.simulate(scene, eqx.tree_at(lambda state: state.u, on, on.u + 1e-3), t1=0.5)
+    assert 1e-5 < motion.moved_u < 2e-3
     assert jnp.max(jnp.abs(motion.residuals()[1])) < 1e-13
 
 
 def test_too_few_steps_are_a_result_code_and_an_error_only_on_request():
     motion = jj.simulate(ChaplyginSleigh(), t1=5.0, max_steps=8)
     assert motion.result == results.MAX_STEPS
-    assert np.isnan(np.asarray(motion.q)[-1]).all()
-    assert np.isfinite(np.asarray(motion.q_end)).all()
+    assert np.isnan(motion.q[-1]).all()
+    assert np.isfinite(motion.q_end).all()
     with pytest.raises(jj.SimulationError, match=r"`ChaplyginSleigh` at t = .* s: ran out of steps"):
         motion.raise_if_failed()
 
 
-def test_accelerations_that_are_not_finite_are_a_result_code():
-    class Blown(Falling):
-        def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=jnp.sqrt(0.5 - motion.t)),)
-
-    motion = jj.simulate(Blown(), t1=1.0, rtol=1e-6, atol=1e-6)
-    assert int(motion.result) in (results.STEP_TOO_SMALL, results.NOT_FINITE)
-    assert 0.4 < float(motion.t_end) <= 0.5 + 1e-6
-
-
 def test_reversed_time_runs_back_to_the_start():
     there = jj.simulate(ChaplyginSleigh(), t1=2.0, rtol=1e-11, atol=1e-11)
-    scene = there.scene
-    end = jj.consistent(scene, 2.0, there.q_end, there.u_end)
-    back = jj.simulate(scene, end, t0=2.0, t1=0.0, rtol=1e-11, atol=1e-11)
+    back = jj.simulate(there.scene, there.end, t1=0.0, rtol=1e-11, atol=1e-11)
     assert_allclose(back.q_end, there.q[0], atol=1e-8)
 
 
 def test_simulate_traces_once_for_different_numbers():
-    import equinox as eqx
-
-    run = eqx.filter_jit(
-        eqx.debug.assert_max_traces(
-            lambda scene, start: jj.simulate(scene, start, t1=0.5).q_end, max_traces=1
-        )
-    )
+    end = lambda scene, start: jj.simulate(scene, start, t1=0.5).q_end
+    run = eqx.filter_jit(eqx.debug.assert_max_traces(end, max_traces=1))
     for mass in (1.0, 2.0):
         scene = Falling(mass=mass)
         run(scene, jj.start(scene, z_rate=mass))
@@ -192,13 +175,8 @@ def test_rows_that_a_motion_leaves_are_warned_of():
 
 def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():
     def pulled(inertia, reduction):
-        return jj.simulate(
-            Trolley(inertia=inertia),
-            t1=2.0,
-            ts=[0.0, 2.0],
-            formulation=jj.Formulation("full", reduction),
-            max_steps=2000,
-        )
+        options = {"formulation": jj.Formulation("full", reduction), "max_steps": 2000}
+        return jj.simulate(Trolley(inertia=inertia), ts=[0.0, 2.0], **options)
 
     by_wheel = Privileged((2,))
     for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-20, "qr")):
@@ -230,16 +208,8 @@ def test_named_access_reaches_coordinates_speeds_and_time(rolling):
 
 def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
     text = str(rolling)
-    for part in (
-        "Trajectory of TiltingDisc",
-        "reached the end",
-        "Dopri8",
-        "minimal",
-        "drift",
-        "velocity",
-        "friction coefficient needed",
-        "N",
-    ):
+    parts = ("Trajectory of TiltingDisc", "reached the end", "Dopri8", "minimal", "drift", "velocity", "N")
+    for part in (*parts, "friction coefficient needed"):
         assert part in text
     assert rolling._repr_html_().startswith(f"<pre>{text[:60]}")
     assert "no drift from one saved time" in str(jj.simulate(rolling.scene, {"lean": 0.3}, ts=[0.1]))
@@ -247,7 +217,7 @@ def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
 
 def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
     centre = np.asarray(rolling.point("disc"))
-    assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
+    assert_allclose(centre[:, 2], 0.5 * np.cos(rolling["lean"]), atol=1e-14)
     assert_array_equal(centre, rolling.motions()["disc"].position)
     with pytest.raises(
         KeyError,
@@ -263,7 +233,7 @@ def test_a_motion_goes_on_from_the_end_of_another():
     first = jj.simulate(scene, start, t1=0.7)
     second = jj.simulate(scene, first.end, ts=[1.5])
     whole = jj.simulate(scene, start, t1=1.5)
-    assert float(second.ts[0]) == 1.5
+    assert second.ts[0] == 1.5
     assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
     assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
 
@@ -283,7 +253,7 @@ def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fie
         assert motion.accepted == int(by_name.accepted)
     lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
     assert lanes.lane(0).accepted == int(by_name.accepted)
-    assert float(log_likelihood(SLEIGH, DATA, options=coarse)) == float(
+    assert log_likelihood(SLEIGH, DATA, options=coarse) == float(
         log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf)
     )
 
@@ -302,7 +272,7 @@ def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
         MODELS["ball-on-turntable"]()
     )  # ended at 4.9 of 10 s with a step size that shrank to nothing
     assert motion.result == results.SUCCESS
-    assert float(motion.t_end) == 10.0
+    assert motion.t_end == 10.0
 
 
 @pytest.mark.parametrize("solver", [diffrax.Bosh3(), jj.ImplicitMidpoint(step=0.01)])
@@ -314,11 +284,9 @@ def test_any_solver_lands_on_the_saved_times(solver):
 
 
 def test_an_implicit_solver_serves_a_projected_scene():
-    scene = MODELS["double-pendulum-rods"]()
     options = {"t1": 0.5, "rtol": 1e-8, "atol": 1e-8}
     implicit, explicit = (
-        jj.simulate(scene, solver=diffrax.Kvaerno5(), **options),
-        jj.simulate(scene, **options),
+        jj.simulate(DoublePendulumRods(), solver=solver, **options) for solver in (diffrax.Kvaerno5(), None)
     )
     assert implicit.result == results.SUCCESS
     assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
@@ -342,11 +310,7 @@ class Tied(jj.Scene):
 
 
 def test_a_batch_is_probed_near_its_own_parameters():
-    lanes = jj.rollout(
-        Tied(length=6.0),
-        {"x": np.sqrt([16.0, 27.0]), "z_rate": 1.0},
-        parameters={"length": np.array([5.0, 6.0])},
-        t1=0.5,
-    )
+    start, lengths = {"x": np.sqrt([16.0, 27.0]), "z_rate": 1.0}, {"length": np.array([5.0, 6.0])}
+    lanes = jj.rollout(Tied(length=6.0), start, parameters=lengths, t1=0.5)
     assert list(lanes.result) == [results.SUCCESS, results.SUCCESS]
     assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)

@@ -63,20 +63,18 @@ def test_privileged_velocities_say_that_they_do_not_apply_across_the_slope():
         assert solved.applicable == _applies(name, np.pi / 2), name
 
 
-def test_the_skate_drifts_across_the_slope():
-    run = skate.RUN
-    scene = Skate(
-        run["mass"], run["inertia"], run["slope"], run["gravity"]
-    )  # passes heading 90 degrees, where x' is no privileged speed
-    assert end_error(
-        scene, {"heading_rate": run["th_rate"]}, skate.motion, run, "x y", heading="th"
-    ) <= tolerance("closed_form")
-
-
-def test_a_moving_skate_follows_its_closed_form():
-    run = skate.RUN | {"u0": 0.9, "th0": 0.4, "th_rate": -0.7}
-    start = {"heading": 0.4, "x_rate": 0.9 * np.cos(0.4), "y_rate": 0.9 * np.sin(0.4), "heading_rate": -0.7}
-    assert end_error(Skate(), start, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
+@pytest.mark.parametrize("moving", [{}, {"u0": 0.9, "th0": 0.4, "th_rate": -0.7}])
+def test_the_skate_drifts_across_the_slope_as_by_its_closed_form(moving):
+    run = skate.RUN | moving  # passes heading 90 degrees, where x' is no privileged speed
+    scene = Skate(run["mass"], run["inertia"], run["slope"], run["gravity"])
+    u, th = run["u0"], run["th0"]
+    start = {
+        "heading": th,
+        "x_rate": u * np.cos(th),
+        "y_rate": u * np.sin(th),
+        "heading_rate": run["th_rate"],
+    }
+    assert end_error(scene, start, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
 
 
 def test_the_sleighs_blade_obeys_the_reduced_equations():

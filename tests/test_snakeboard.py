@@ -23,12 +23,7 @@ START = {
 def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
     times = np.linspace(0.0, oracle.RUN["t_end"], 10)  # steer is 90 degrees between the fifth and the sixth
     motion = jj.simulate(
-        BOARD,
-        START,
-        ts=jnp.asarray(times),
-        rtol=1e-12,
-        atol=1e-12,
-        formulation=jj.Formulation(reduction=reduction),
+        BOARD, START, ts=times, rtol=1e-12, atol=1e-12, formulation=jj.Formulation(reduction=reduction)
     )
     expected = oracle.motion(times, **oracle.RUN)
     pairs = {
@@ -54,14 +49,14 @@ def test_a_retry_passes_wherever_a_step_ends_near_the_loss_of_rank():
     times = np.linspace(0.0, oracle.RUN["t_end"], 9)
     for beyond in (0.0, 1e-15, 3e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, -1e-13, -1e-11):
         shifted = times + beyond * (np.arange(9) == 4)
-        motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12, retry=True)
+        motion = jj.simulate(BOARD, START, ts=shifted, rtol=1e-12, atol=1e-12, retry=True)
         assert motion.result == results.SUCCESS, beyond
         assert "cutoff 1e-08" in str(motion.reduction)
         assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance(
             "closed_form"
         ), beyond
 
-    alone = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-6, atol=1e-6)
+    alone = jj.simulate(BOARD, START, ts=times, rtol=1e-6, atol=1e-6)
     assert alone.result == results.STEP_TOO_SMALL
     assert alone["steer"][4 - 1] < np.pi / 2
     with pytest.raises(jj.SimulationError, match="where constraints lose rank, pass retry=True"):

@@ -29,18 +29,11 @@ def test_a_disc_rolls_in_the_circle_of_the_closed_form(lean, yaw_rate):
     found = steady(TiltingDisc(**DISC), {**GUESS, "lean": lean, "yaw_rate": yaw_rate}, held=HELD)
     assert found.converged
     assert found.residual < 1e-11  # rad/s^2, with spins up to 20 rad/s
-    assert float(found["lean"]) == lean
-    assert float(found["yaw_rate"]) == yaw_rate
-    assert float(found["lean_rate"]) == pytest.approx(0.0, abs=1e-12)
-    assert float(found["spin_rate"]) == pytest.approx(_circle(lean, yaw_rate), rel=1e-12)
+    assert found["lean"] == lean
+    assert found["yaw_rate"] == yaw_rate
+    assert found["lean_rate"] == pytest.approx(0.0, abs=1e-12)
+    assert found["spin_rate"] == pytest.approx(_circle(lean, yaw_rate), rel=1e-12)
     assert "steady motion" in str(found)
-
-
-def test_a_disc_keeps_to_the_circle_it_was_put_on():
-    disc = TiltingDisc(**DISC)
-    ride = jj.simulate(disc, steady(disc, GUESS, held=HELD).state, t1=5.0, rtol=1e-10, atol=1e-10)
-    assert jnp.max(jnp.abs(ride["lean"] - 0.3)) < 1e-8
-    assert jnp.max(jnp.abs(ride["yaw_rate"] - 2.0)) < 1e-8
 
 
 def _spin(radius, lean):
@@ -108,7 +101,7 @@ def test_where_there_is_no_steady_motion_the_residual_says_so():
 def test_a_motion_forbidden_to_move_comes_to_rest():
     found = steady(TiltingDisc(**DISC), {"lean": 0.1, "yaw_rate": 1.0, "spin_rate": 1.0}, moving=())
     assert_allclose(found.state.u, np.zeros(5), atol=1e-10)
-    assert float(found["lean"]) == pytest.approx(0.0, abs=1e-10)
+    assert found["lean"] == pytest.approx(0.0, abs=1e-10)
 
 
 class Sprung(OnLine):
@@ -128,7 +121,7 @@ def test_an_equilibrium_is_that_of_the_inputs_and_of_the_time():
     # the load that depends on time is -1 N at pi s, and does not change there: 4 x + x^3 = 2.125
     found = steady(Sprung(), {"x": 0.1}, t0=np.pi, inputs={"push": 3.125})
     assert found.converged
-    assert float(found["x"]) == pytest.approx(0.5, rel=1e-12)
+    assert found["x"] == pytest.approx(0.5, rel=1e-12)
     moving = steady(Sprung(), {"x": 0.1}, t0=1.0, inputs={"push": 3.125})
     assert not moving.converged
     assert moving.residual == pytest.approx(np.sin(1.0), rel=1e-6)  # |d2y/dt2|

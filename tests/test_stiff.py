@@ -24,7 +24,7 @@ class Damped(OnLine):
     `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t.
     """
 
-    rate: object = jj.parameter(1e7, unit="1/s", positive=True)
+    rate: object = jj.parameter(1e7, positive=True)
 
     def loads(self, motion):
         return (
@@ -118,7 +118,7 @@ class TurnedSkate(jj.models.Skate):
     serve which fails at a right angle.
     """
 
-    damping: object = jj.parameter(0.0, unit="N m s")
+    damping: object = jj.parameter(0.0)
     domain = {"heading": (-0.5, 0.5)}
 
     def loads(self, motion):
@@ -165,7 +165,7 @@ def test_steps_that_shrink_towards_a_singularity_are_named():
     motion = jj.simulate(Centre(), {"x": 1.0}, ts=TS, max_steps=70)
     assert motion.result == results.SHRANK
     assert "shrunk" in motion.message
-    assert 0 < float(motion.last_step) < 1e-3
+    assert 0 < motion.last_step < 1e-3
     assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
 
 
@@ -248,7 +248,7 @@ def followed(height, x):
 
 
 @pytest.mark.parametrize("options", [{"retry": True}, {"solver": jj.RadauIIA()}], ids=["default", "RadauIIA"])
-def test_a_stiff_motion_is_right_at_its_event_and_so_is_its_derivative(options):
+def test_a_stiff_motion_is_right_at_its_event(options):
     """It is located by steps of the solver that followed the motion."""
     for height, x in ((7.3, 0.85), (0.4, -1.0)):
         motion = jj.simulate(Following(), {"y": height, "x": x}, ts=[6.0], max_steps=20_000, **options)
@@ -257,30 +257,24 @@ def test_a_stiff_motion_is_right_at_its_event_and_so_is_its_derivative(options):
         expected = followed(height, x)
         assert_allclose(motion.q_end, [expected, 0.0], rtol=0, atol=5e-6)
         assert_allclose(motion.u_end, [-expected, -np.sqrt(2 * height)], rtol=0, atol=2e-5)
-    if "solver" in options:
-        slope = jax.jacrev(
-            lambda height: jj.simulate(Following(), {"y": height, "x": 0.85}, ts=[6.0], **options).q_end[0]
-        )(7.3)
-        assert_allclose(
-            slope, (followed(7.3 + 1e-5, 0.85) - followed(7.3 - 1e-5, 0.85)) / 2e-5, rtol=0, atol=2e-5
-        )
 
 
 def test_zero_is_no_attitude():
     top = jj.models.FreeRigidBody()
     none = jj.consistent(top, 0.0, jnp.zeros(7), jnp.zeros(6))
-    assert float(none.residual) == 0.5
+    assert none.residual == 0.5
     assert jj.simulate(top, none, t1=1.0).result == results.INCONSISTENT_START
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_start_that_is_not_finite_is_not_called_consistent(value):
+def test_a_start_that_is_not_finite_is_not_called_consistent():
     skate = jj.models.Skate()
-    state = jj.consistent(skate, 0.0, jnp.array([0.0, value, 0.0]), jnp.zeros(3))
-    assert float(state.residual) == np.inf
-    assert jj.simulate(skate, state, t1=1.0).result == results.BAD_START
+    for value in (np.nan, np.inf):
+        state = jj.consistent(skate, 0.0, jnp.array([0.0, value, 0.0]), jnp.zeros(3))
+        assert state.residual == np.inf
+        assert jj.simulate(skate, state, t1=1.0).result == results.BAD_START
 
 
 def test_the_discrete_lagrange_dalembert_equations_are_named_as_such():
-    motion = jj.simulate(jj.models.Skate(), t1=0.1, solver=jj.DiscreteLagrangeDAlembert(step=0.05))
+    solver = jj.DiscreteLagrangeDAlembert(step=0.05)
+    motion = jax.eval_shape(lambda: jj.simulate(jj.models.Skate(), t1=0.1, solver=solver))
     assert motion.reduction == "none, discrete Lagrange-d'Alembert equations, midpoint rule"

@@ -32,15 +32,9 @@ class Belt(OnBelt):
 
 @pytest.fixture(scope="module")
 def motions():
-    alone = jj.simulate(Belt(drag=0.3, sides=3), {"y": 0.1}, ts=TS, inputs=INPUTS)
-    lanes = jj.rollout(
-        Belt(sides=3),
-        {"y": 0.1},
-        parameters={"drag": np.array([0.3, 0.4])},
-        ts=TS,
-        inputs=INPUTS,
-        progress=False,
-    )
+    start, given = {"y": 0.1}, {"ts": TS, "inputs": INPUTS}
+    alone = jj.simulate(Belt(drag=0.3, sides=3), start, **given)
+    lanes = jj.rollout(Belt(sides=3), start, parameters={"drag": np.array([0.3, 0.4])}, **given)
     return {"trajectory": alone, "rollout": lanes}
 
 
@@ -75,22 +69,20 @@ def _contents(path):
 def spoilt_arrays(arrays):
     """What may have happened to each array, and what is then wrong with it."""
     for name, x in arrays.items():
-        yield f"{name} removed", {name: None}
-        yield f"{name} with an axis more", {name: x[..., None]}
+        made = {
+            "removed": None,
+            "with an axis more": x[..., None],
+            "complex": x + 1j,
+            "as text": x.astype(str),
+        }
         if x.ndim and x.size:
-            yield f"{name} cut short", {name: x[..., :-1]}
-            yield f"{name} of fewer", {name: x[:-1]}
-            yield f"{name} doubled", {name: np.concatenate([x, x])}
-            yield f"{name} without its first axis", {name: x[0]}
-        yield f"{name} complex", {name: x + 1j}
-        yield f"{name} as text", {name: x.astype(str)}
+            made |= {"cut short": x[..., :-1], "of fewer": x[:-1], "doubled": np.concatenate([x, x])}
+            made |= {"without its first axis": x[0]}
         if x.dtype.kind == "f":
-            yield f"{name} whole numbers", {name: np.zeros(x.shape, int)}
-            yield f"{name} not finite", {name: np.full(x.shape, np.nan)}
+            made |= {"whole numbers": np.zeros(x.shape, int), "not finite": np.full(x.shape, np.nan)}
         elif x.size:
-            yield f"{name} with a fraction", {name: x + 0.5}
-            yield f"{name} out of range", {name: x + 1000}
-            yield f"{name} negative", {name: x - 1000}
+            made |= {"with a fraction": x + 0.5, "out of range": x + 1000, "negative": x - 1000}
+        yield from ((f"{name} {what}", {name: y}) for what, y in made.items())
 
 
 def spoilt_headers(header):
@@ -227,16 +219,16 @@ def test_whatever_happens_to_a_byte_of_a_file_it_is_the_motion_or_named(saved, t
 def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
     scene = jj.models.TiltingDisc()
     start = {"lean": 0.3, "spin_rate": -3.0}
-    for k, motion in enumerate(
-        (
-            jj.simulate(scene, start, t0=1.0, t1=0.0),
-            jj.simulate(scene, {"lean": 0.9}, t1=5.0),  # falls
-            jj.simulate(scene, start, ts=[0.3, 0.3 + 1e-15, 0.7]),
-            jj.simulate(scene, start, ts=[0.5]),
-        )
+    falls = ({"lean": 0.9}, {"t1": 5.0})
+    for begin, times in (
+        (start, {"t0": 1.0, "t1": 0.0}),
+        falls,
+        (start, {"ts": [0.3, 0.3 + 1e-15, 0.7]}),
+        (start, {"ts": [0.5]}),
     ):
-        jj.save(motion, tmp_path / f"{k}.npz")
-        assert_equal_to_the_bit(jj.load_trajectory(tmp_path / f"{k}.npz", type(scene)), motion)
+        motion = jj.simulate(scene, begin, **times)
+        jj.save(motion, tmp_path / "motion.npz")
+        assert_equal_to_the_bit(jj.load_trajectory(tmp_path / "motion.npz", type(scene)), motion)
 
 
 def changed(**parameters):
@@ -272,8 +264,8 @@ def test_a_class_that_changed_since_is_named(saved, kind, message):
 
 @pytest.mark.parametrize("stage", ["savez_compressed", "fsync", "replace"])
 def test_an_interrupted_save_leaves_the_old_file_and_nothing_else(motions, tmp_path, monkeypatch, stage):
-    path = tmp_path / "kept.npz"
-    jj.save(motions["trajectory"], path)
+    motion, path = motions["trajectory"], tmp_path / "kept.npz"
+    jj.save(motion, path)
     before = path.read_bytes()
 
     def interrupted(*args, **kwargs):
@@ -283,13 +275,14 @@ def test_an_interrupted_save_leaves_the_old_file_and_nothing_else(motions, tmp_p
 
     monkeypatch.setattr(np if stage == "savez_compressed" else os, stage, interrupted)
     with pytest.raises(KeyboardInterrupt):
-        jj.save(motions["trajectory"], path)
+        jj.save(motion, path)
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
-    jj.save(motions["trajectory"], path)
+    jj.save(motion, path)
     jj.load_trajectory(path, Belt)
-    (tmp_path / "link.npz").symlink_to(path)
-    jj.save(motions["trajectory"], tmp_path / "link.npz")
-    assert (tmp_path / "link.npz").is_symlink()
+    link = tmp_path / "link.npz"
+    link.symlink_to(path)
+    jj.save(motion, link)
+    assert link.is_symlink()
     assert len(list(tmp_path.iterdir())) == 2

@@ -13,7 +13,7 @@ import result_codes as results
 from long_runs_scenes import ContactOscillator, GaugeTwin
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import chaplygin_sleigh, skate
-from small_scenes import DrivenPendulum
+from small_scenes import DrivenPendulum, Oscillator
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -45,17 +45,12 @@ def order(errors):
 @pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
 def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
     data = chaplygin_sleigh.RUN | {"t_end": 4.0}
-    v0, w0, a = data["v0"], data["w0"], data["a"]
-    exact = {
-        name: values[-1]
-        for name, values in chaplygin_sleigh.motion(np.linspace(0.0, 4.0, 5), x0=0.0, y0=0.0, **data).items()
-    }
-    sleigh = MODELS["chaplygin-sleigh"](mass=data["mass"], inertia=data["inertia"], offset=a)
-    start = jj.start(sleigh, x_rate=v0, heading_rate=w0)
-    errors = []
-    for step in (0.05, 0.025):
-        end = run(sleigh, start, solver, t1=4.0, step=step)
-        errors.append(np.max(np.abs(np.asarray(end.q_end) - [exact["x"], exact["y"], exact["th"]])))
+    exact = chaplygin_sleigh.motion(np.linspace(0.0, 4.0, 5), x0=0.0, y0=0.0, **data)
+    right = np.array([exact[name][-1] for name in ("x", "y", "th")])
+    sleigh = MODELS["chaplygin-sleigh"](mass=data["mass"], inertia=data["inertia"], offset=data["a"])
+    start = jj.start(sleigh, x_rate=data["v0"], heading_rate=data["w0"])
+    ends = [run(sleigh, start, solver, t1=4.0, step=step) for step in (0.05, 0.025)]
+    errors = [np.max(np.abs(end.q_end - right)) for end in ends]
     assert errors[-1] < 1e-3
     assert 1.9 < order(errors) < 2.1
 
@@ -81,14 +76,10 @@ def test_rows_that_depend_on_each_other_are_left_out():
 
     data = skate.RUN | {"t_end": 1.0}
     edges = TwoEdges(slope=data["slope"], mass=data["mass"], inertia=data["inertia"])
-    exact = skate.motion(np.array([0.0, 1.0]), **data)
-    errors = [
-        np.abs(
-            run(edges, jj.start(edges, heading_rate=data["th_rate"]), DLA, t1=1.0, step=step).q_end[0]
-            - exact["x"][-1]
-        )
-        for step in (0.05, 0.025)
-    ]
+    exact = skate.motion(np.array([0.0, 1.0]), **data)["x"][-1]
+    start = jj.start(edges, heading_rate=data["th_rate"])
+    ends = [run(edges, start, DLA, t1=1.0, step=step) for step in (0.05, 0.025)]
+    errors = [np.abs(end.q_end[0] - exact) for end in ends]
     assert errors[-1] < 1e-3
     assert 1.9 < order(errors) < 2.1
 
@@ -118,10 +109,7 @@ def test_steps_back_undo_the_steps_forth(solver):
     twin = GaugeTwin()
     start = jj.start(twin, **twin.example)
     there = run(twin, start, solver, t1=4.0, step=0.2)
-    end = jj.State(
-        there.t_end, there.q_end, there.u_end, start.moved_q, start.moved_u, start.residual, start.names
-    )
-    back = run(twin, end, solver, t0=4.0, t1=0.0, step=0.2)
+    back = run(twin, there.end, solver, t0=4.0, t1=0.0, step=0.2)
     assert np.max(np.abs(there.q_end - start.q)) > 0.1
     assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
     assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
@@ -182,21 +170,14 @@ def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
 def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved():
     oscillator = ContactOscillator()
     strengths = jnp.array([0.0, 0.3, 0.6, 1e8])  # at the last, a step of 0.2 s is thousands of periods
-    starts = {"x": jnp.ones(4), "y": 1.0, "z": 0.5, "y_rate": 0.3}
-    rolled = jj.rollout(
-        oscillator, starts, parameters={"strength": strengths}, ts=[0.0, 2.0, 4.0], solver=DLA(step=0.2)
-    )
+    start = {"x": 1.0, "y": 1.0, "z": 0.5, "y_rate": 0.3}
+    options = {"parameters": {"strength": strengths}, "ts": [0.0, 2.0, 4.0], "solver": DLA(step=0.2)}
+    rolled = jj.rollout(oscillator, start, **options)
     assert rolled.result.tolist() == [results.SUCCESS] * 3 + [results.UNSOLVED_STEP]
     assert "equations of an implicit step were not solved" in str(rolled)
-    assert not np.isfinite(np.asarray(rolled.lanes.q[3, -1])).any()
-    assert np.isfinite(np.asarray(rolled.lanes.q_end)).all()
-    alone = run(
-        oscillator.replace(strength=0.6),
-        jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3),
-        DLA,
-        t1=4.0,
-        step=0.2,
-    )
+    assert not np.isfinite(rolled.lanes.q[3, -1]).any()
+    assert np.isfinite(rolled.lanes.q_end).all()
+    alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, **start), DLA, t1=4.0, step=0.2)
     assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
 
 
@@ -204,11 +185,9 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
 
 
 def test_steps_between_saved_times_are_equal_and_no_longer_than_asked():
-    oscillator = ContactOscillator()
-    motion = jj.simulate(oscillator, ts=[0.0, 1.0, 1.5, 4.0], solver=MIDPOINT(step=0.3))
-    assert motion.raise_if_failed().accepted == 4 + 2 + 9
-    whole = jj.simulate(oscillator, ts=[0.0, 1.0, 1.5, 3.0], t1=3.0, solver=MIDPOINT(step=0.1))
-    assert whole.raise_if_failed().accepted == 30
+    for end, step, count in ((4.0, 0.3, 4 + 2 + 9), (3.0, 0.1, 30)):
+        motion = jj.simulate(Oscillator(), {"x": 0.3}, ts=[0.0, 1.0, 1.5, end], solver=MIDPOINT(step=step))
+        assert motion.raise_if_failed().accepted == count
 
 
 def test_reversed_time_is_what_projections_and_events_are_given():
@@ -218,11 +197,9 @@ def test_reversed_time_is_what_projections_and_events_are_given():
         def events(self, motion):
             return {"clock": motion.t - 0.5}
 
-    pendulum = Watched()
-    start = jj.start(pendulum, t0=1.0, angle=0.3)
-    back = jj.simulate(
-        pendulum, start, t1=0.0, ts=[1.0, 0.0], rtol=1e-8, atol=1e-8, solver=diffrax.Bosh3(), work=False
-    )
+    start = jj.start(Watched(), t0=1.0, angle=0.3)
+    options = {"rtol": 1e-8, "atol": 1e-8, "solver": diffrax.Bosh3(), "work": False}
+    back = jj.simulate(Watched(), start, ts=[1.0, 0.0], **options)
     assert back.result == results.EVENT
     assert_allclose(back.t_end, 0.5, rtol=1e-12)
     assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot

@@ -75,7 +75,7 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
             assert arrays[name][number] == pytest.approx(float(expected), rel=1e-9, abs=1e-9, nan_ok=True), (
                 name
             )
-        assert float(motion.scene.radius) == lane.parameters["radius"] == float(arrays["radius"][number])
+        assert motion.scene.radius == lane.parameters["radius"] == float(arrays["radius"][number])
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
 

@@ -87,28 +87,6 @@ def test_neither_axle_row_may_be_dropped_as_redundant(row, heading):
     assert row not in jj.structure_of(TwoWheelAxleRedundant(**PARAMETERS)).redundant_rows
 
 
-def test_redundant_rows_give_the_accelerations_and_forces_of_ten_rows():
-    free, redundant = TwoWheelAxleFree(**PARAMETERS), TwoWheelAxleRedundant(**PARAMETERS)
-    _, q, u = (jnp.asarray(x) for x in jj.sample_states(free, 20))
-    for heading in (0.0, np.pi / 2):  # (60b), (60a) do their work alone here
-        turned, moving, _ = free.named(
-            phi1=heading, phi2=heading, z1=0.27, z2=0.27, psi1_rate=1.0, phi1_rate=0.5
-        )
-        q, u = (
-            jnp.concatenate([q, turned[None]]),
-            jnp.concatenate([u, jj.consistent(free, 0.0, turned, moving).u[None]]),
-        )
-
-    @jax.jit
-    @jax.vmap
-    def both(q, u):
-        return tuple(jj.accelerations(scene, 0.0, q, u) for scene in (free, redundant))
-
-    ten, eleven = both(q, u)
-    assert relative_error(eleven.udot, ten.udot) <= ROUND_OFF
-    assert relative_error(eleven.constraint_force, ten.constraint_force) <= ROUND_OFF
-
-
 def _rolling_acceleration(reduction, x):
     """psi1'' of the eleven rows, at speeds on the rows for every x, so that their rank stays 10."""
     a, l, M, m, slope, phi = x

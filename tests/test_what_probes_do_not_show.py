@@ -42,10 +42,6 @@ class Fading(OnPlane):
         )
 
 
-def test_calls_whose_operands_differ_later_stay_two():
-    assert len(jj.lower(Fading()).graph.calls(jj.lower(Fading()).ydot)) == 2
-
-
 class Filtered(OnPlane):
     """Two calls of one kind: what they are given as numbers is the same, the arrays that other calls hand
     them are not.
@@ -68,8 +64,11 @@ class Filtered(OnPlane):
         )
 
 
-def test_calls_of_what_different_calls_made_stay_two():
-    assert len(jj.lower(Filtered()).graph.calls(jj.lower(Filtered()).ydot)) == 5  # three filtered, two halved
+# operands differ later; three filtered, two halved
+@pytest.mark.parametrize(("scene", "count"), [(Fading(), 2), (Filtered(), 5)])
+def test_calls_that_differ_later_or_in_what_made_their_operands_stay_apart(scene, count):
+    program = jj.lower(scene)
+    assert len(program.graph.calls(program.ydot)) == count
 
 
 class Pushed(OnPlane):
@@ -103,12 +102,9 @@ def test_a_force_that_acts_later_elsewhere_or_for_other_parameters_is_there(name
 
 def test_a_force_that_sets_in_later_acts_and_one_program_serves_all_parameters():
     later, spring = Pushed(PUSHES["switched on"]), Pushed(PUSHES["tiny by its parameter"])
-    assert jj.simulate(later, {"x": 1.0}, t1=3.0, rtol=1e-9, atol=1e-9).q_end[0] == pytest.approx(
-        np.cos(2.0), abs=1e-7
-    )
-    lanes = jj.rollout(
-        spring, {"x": 1.0}, parameters={"size": jnp.array([1e-10, 4.0])}, t1=1.0, rtol=1e-9, atol=1e-9
-    ).lanes
+    assert_allclose(jj.simulate(later, {"x": 1.0}, t1=3.0, **TIGHT).q_end[0], np.cos(2.0), atol=1e-7)
+    sizes = {"size": jnp.array([1e-10, 4.0])}
+    lanes = jj.rollout(spring, {"x": 1.0}, parameters=sizes, t1=1.0, **TIGHT).lanes
     assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
 
 

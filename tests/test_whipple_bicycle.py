@@ -41,7 +41,7 @@ def other_bicycle():
 
 def test_defaults_are_the_benchmark_bicycle():
     for name, value in oracle.BENCHMARK.items():
-        assert float(getattr(BICYCLE, name)) == value
+        assert getattr(BICYCLE, name) == value
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.6, 10.0])
@@ -81,10 +81,10 @@ def test_the_front_contact_is_the_lowest_point_of_the_wheel_at_any_lean_and_stee
 def test_rear_wheel_and_front_wheel_roll_without_slip():
     for t, q, u in admissible_states(BICYCLE, 10):
         motion = jj.motion_at(BICYCLE, t, q, u)
-        for name, wheel in (("rear wheel", motion["rear wheel"]), ("front wheel", motion["front wheel"])):
+        for name, radius in (("rear wheel", BICYCLE.rR), ("front wheel", BICYCLE.rF)):
+            wheel = motion[name]
             heading = jnp.cross(wheel.orientation[:, 1], jnp.array([0.0, 0.0, 1.0]))
             down = jnp.cross(heading / jnp.linalg.norm(heading), wheel.orientation[:, 1])
-            radius = BICYCLE.rR if name == "rear wheel" else BICYCLE.rF
             slip = wheel.velocity_at(wheel.position - jnp.sign(down[2]) * radius * down)
             assert jnp.max(jnp.abs(slip)) <= tolerance("round_off"), name
 
@@ -112,13 +112,8 @@ def test_a_hands_free_ride_keeps_its_energy_and_its_contacts():
 
 
 def test_a_slow_bicycle_falls_and_the_ride_stops():
-    ride = jj.simulate(
-        BICYCLE,
-        {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0},
-        t1=5.0,
-        rtol=1e-10,
-        atol=1e-10,
-    )
+    start = {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0}
+    ride = jj.simulate(BICYCLE, start, t1=5.0, rtol=1e-10, atol=1e-10)
     assert ride.event_names[int(ride.event)] == "fallen"
     lean_left, steer_left = 1.2 - abs(ride.q_end[LEAN]), jnp.pi / 2 - abs(ride.q_end[STEER])
     assert abs(min(lean_left, steer_left)) <= 1e-9

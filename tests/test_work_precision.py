@@ -18,19 +18,11 @@ SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
 
 
 def _exact_sleigh():
-    found = {
-        name: values[-1]
-        for name, values in chaplygin_sleigh.motion(
-            [0.0, SLEIGH.end], **_without_end(chaplygin_sleigh.RUN)
-        ).items()
-    }
-    c, s, a = np.cos(found["th"]), np.sin(found["th"]), chaplygin_sleigh.RUN["a"]
-    speeds = [found["v"] * c - a * found["w"] * s, found["v"] * s + a * found["w"] * c, found["w"]]
-    return np.array([found["x"], found["y"], found["th"]]), np.array(speeds)
-
-
-def _without_end(run):
-    return {name: value for name, value in run.items() if name != "t_end"}
+    run = {name: value for name, value in chaplygin_sleigh.RUN.items() if name != "t_end"}
+    found = chaplygin_sleigh.motion([0.0, SLEIGH.end], **run)
+    x, y, th, v, w = (found[name][-1] for name in ("x", "y", "th", "v", "w"))
+    c, s, a = np.cos(th), np.sin(th), run["a"]
+    return np.array([x, y, th]), np.array([v * c - a * w * s, v * s + a * w * c, w])
 
 
 def _constant(y):
@@ -53,10 +45,8 @@ def test_the_reference_says_how_far_a_second_computation_is():
 
 def test_a_curve_gives_records_of_one_format():
     q, u = _exact_sleigh()
-    found, ready = measure.points(
-        SLEIGH, curve.Curve("exact", (1e-3,), _constant(np.concatenate([q, u[:2]]))), lambda text: None
-    )
-    (entry,) = found
+    exact = curve.Curve("exact", (1e-3,), _constant(np.concatenate([q, u[:2]])))
+    (entry,), ready = measure.points(SLEIGH, exact, lambda text: None)
     assert tuple(entry) == record.KEYS
     assert entry == json.loads(json.dumps(entry))
     assert entry["error"] <= tolerance("closed_form")
@@ -79,17 +69,7 @@ def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
 
 def test_a_record_of_an_unknown_kind_is_refused():
     with pytest.raises(ValueError, match="`kind` is 'theirs'"):
-        record.record(
-            problem="",
-            method="",
-            kind="theirs",
-            setting=0.0,
-            setting_unit="",
-            batch=1,
-            error=None,
-            seconds=None,
-            versions={},
-        )
+        record.record(**dict.fromkeys(record.KEYS) | {"kind": "theirs"})
 
 
 @pytest.mark.parametrize(
@@ -117,8 +97,8 @@ def test_a_free_body_is_read_as_the_disc_that_it_is():
     # and spin
     radius = float(DISC.scene.radius)
     q, u = disc_body.state(radius, disc_body.start(radius, DISC.minimal_start), {"yaw": 0.0, "spin": 0.0})
-    assert np.max(np.abs(q - np.asarray(DISC.state.q))) <= tolerance("round_off")
-    assert np.max(np.abs(u - np.asarray(DISC.state.u))) <= tolerance("round_off")
+    assert np.max(np.abs(q - DISC.state.q)) <= tolerance("round_off")
+    assert np.max(np.abs(u - DISC.state.u)) <= tolerance("round_off")
 
 
 def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():

@@ -15,13 +15,13 @@ def along_x(x):
 class Bead(OnLine):
     """A free bead on a line."""
 
-    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    mass: float = jj.parameter(2.0, positive=True)
 
 
 class GrowingField(Bead):
     """V = -f t x: x = f t^3/(6 m), T = f^2 t^4/(8 m), V = -f^2 t^4/(6 m)."""
 
-    slope: float = jj.parameter(3.0, unit="N/s")
+    slope: float = jj.parameter(3.0)
 
     def potential(self, pose):
         return -self.slope * pose.t * pose.q.x
@@ -33,9 +33,9 @@ class GrowingField(Bead):
 class ShakenAnchor(Bead):
     """m x'' = -k (x - a sin W t), from rest: x = b (sin W t - W/w sin w t), b = a w^2/(w^2 - W^2)."""
 
-    stiffness: float = jj.parameter(18.0, unit="N/m")
-    amplitude: float = jj.parameter(0.1, unit="m")
-    rate: float = jj.parameter(2.0, unit="rad/s")
+    stiffness: float = jj.parameter(18.0)
+    amplitude: float = jj.parameter(0.1)
+    rate: float = jj.parameter(2.0)
 
     def loads(self, motion):
         anchor = jj.fixed_point(along_x(self.amplitude * jnp.sin(self.rate * motion.t)))
@@ -53,8 +53,8 @@ class TurningRates(jj.Scene):
     W t)/2.
     """
 
-    mass: float = jj.parameter(2.0, unit="kg", positive=True)
-    rate: float = jj.parameter(1.3, unit="rad/s")
+    mass: float = jj.parameter(2.0, positive=True)
+    rate: float = jj.parameter(1.3)
     coordinates = jj.coordinates("turn r")
     speeds = jj.speeds("r_rate")
     domain = {"r": (0.2, 1.0)}
@@ -75,7 +75,7 @@ class DrivenOrientation(jj.Scene):
     so T = I ((2 c t)^2 + lean_rate^2)/2.
     """
 
-    rate: float = jj.parameter(0.8, unit="rad/s^2")
+    rate: float = jj.parameter(0.8)
     coordinates = jj.coordinates("lean")
     example = {"lean": 0.3, "lean_rate": 0.7}
 
@@ -93,7 +93,7 @@ class DrivenOrientation(jj.Scene):
 class LosingMass(Bead):
     """A bead that loses mass at its own velocity: it goes on as it went, T = m exp(-c t) v^2/2."""
 
-    loss: float = jj.parameter(0.4, unit="1/s")
+    loss: float = jj.parameter(0.4)
     example = {"x_rate": 1.5}
 
     def bodies(self, t, q):
@@ -106,8 +106,8 @@ class LosingMass(Bead):
 class Lifted(Upright):
     """A weight whose height is prescribed, `height + rate t`: the winch does m g rate t."""
 
-    mass: float = jj.parameter(2.0, unit="kg", positive=True)
-    rate: float = jj.parameter(0.5, unit="m/s")
+    mass: float = jj.parameter(2.0, positive=True)
+    rate: float = jj.parameter(0.5)
     example = {"z": 2.0, "x_rate": 1.0}
 
     def loads(self, motion):
@@ -125,7 +125,7 @@ class Towed(Bead):
     x^2/2.
     """
 
-    stiffness: float = jj.parameter(18.0, unit="N/m")
+    stiffness: float = jj.parameter(18.0)
     inputs = jj.inputs("speed")
 
     def loads(self, motion):

@@ -98,25 +98,3 @@ def integral(function: Callable, times: Sequence, panel: float = 0.25) -> np.nda
         total += float(np.sum(half * (values @ weights)))
         sums.append(total)
     return np.array(sums)
-
-
-def constrained_motion(
-    masses: Sequence, rows: Callable, force: Sequence, q0: Sequence, v0: Sequence, times: Sequence
-) -> np.ndarray:
-    """Motion with multipliers, m q'' = force + A' lambda, A q'' = -Adot v, for constant diagonal masses and
-    forces and full row rank.
-
-    **Arguments:** `rows(q)` gives A, analytic in q: Adot v is found by a complex step. **Returns:** (times,
-    2n): q then v.
-    """
-    m, impressed = np.asarray(masses, LONG), np.asarray(force, LONG) / np.asarray(masses, LONG)
-    n, step = len(m), LONG(1e-30)
-
-    def rhs(t, y):
-        q, v = y[:n], y[n:]
-        nearby = np.array(rows(q + 1j * step * v), np.clongdouble)
-        a, bias = nearby.real, nearby.imag @ v / step
-        multipliers = solve(a @ (a / m).T, -bias - a @ impressed)
-        return np.concatenate([v, impressed + (a.T @ multipliers) / m])
-
-    return integrate(rhs, np.concatenate([np.asarray(q0, LONG), np.asarray(v0, LONG)]), times)

@@ -165,21 +165,6 @@ def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity, inert
     }
 
 
-def upright_rolling_frequency_squared(spin: float, *, mass, radius, gravity, inertia=None) -> float:
-    """Square of the lean frequency when rolling straight at w3 = spin; stable where positive. Uniform: 12/5
-    spin^2 - 4g/5a.
-    """
-    a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
-    ring = mass * radius**2
-    return ((c_moment + ring) * c_moment * spin**2 / a_moment - mass * gravity * radius) / (a_moment + ring)
-
-
-def rolling_threshold(*, mass, radius, gravity, inertia=None) -> float:
-    """Smallest stable spin rate of upright rolling; uniform: sqrt(g/3a)."""
-    a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
-    return float(np.sqrt(a_moment * mass * gravity * radius / (c_moment * (c_moment + mass * radius**2))))
-
-
 def spinning_threshold(*, mass, radius, gravity, inertia=None) -> float:
     """Smallest stable yaw rate of upright spinning on the spot; uniform: sqrt(4g/5a)."""
     a_moment, _ = uniform_inertia(mass, radius) if inertia is None else inertia
