@@ -17,8 +17,6 @@ Equations of special points and their derivatives, as one scalar program. Eigenv
 too.
 """
 
-from collections.abc import Callable
-from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
@@ -30,7 +28,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyEquations, null_space
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
-from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, differentiable
+from jourdain_jax.analysis.motion_derivatives import ByProgram, differentiable
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
@@ -47,23 +45,18 @@ class SpecialProgram:
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
-        graph, (rows, rates, states, of_states, places) = instant.graph, of
+        graph, (rows, rates, states, of_states) = instant.graph, of
         x = [graph.input(f"special {k}", True) for k in range(len(states))]
         moved, at = [instant.v[k] for k in (*rates, *of_states)], [instant.columns[k] for k in states]
         nodes = [instant.v[k] for k in rows] + derivatives(graph, moved, dict(zip(at, x, strict=True)))
-        variables, self.rows = [*instant.given, *x], len(nodes)
-        self._sloped = graph, nodes, [*(instant.given[k] for k in places), *x], variables, instant.guards
-        self.values = differentiable(graph, nodes, variables)
-        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows - len(w))))[0])
-
-    @cached_property
-    def of(self) -> Sloped:
-        """Return the function that computes R, F x, C x and their derivatives with respect to z and x."""
-        return Sloped(*self._sloped)
+        self.values = differentiable(graph, nodes, [*instant.given, *x])
+        self.pulled = jax.jit(
+            lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, len(nodes) - len(w))))[0]
+        )
 
 
 def program_of(equations: SteadyEquations) -> SpecialProgram:
-    of = equations.rows, equations.rates, equations.states, equations.of_states, equations.places
+    of = equations.rows, equations.rates, equations.states, equations.of_states
     return _kept_program(equations.scene, equations.instant, tuple(tuple(part.tolist()) for part in of))
 
 
@@ -141,52 +134,27 @@ class Special(eqx.Module):
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
-    def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Return L and c of the linear equations `L X = c`. They fix the held values, the size and phase of a
-        and b (relative to the point `near`), and w if it is zero.
-        """
-        z, a0, b0, _ = self.parts(near)
-        no, held, size = 0 * a0, self.equations.held, a0 @ a0
-        of_ab = {  # for a zero eigenvalue, b is zero unless steady motions continue at the same parameters
-            PAIR: [(a0, b0, size + b0 @ b0), (-b0, a0, 0.0)],
-            DOUBLE: [(a0, no, size), (no, a0, 0.0)],
-            ZERO: [(a0, no, size), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
-        }[self.kind]
-        a, b, c = (jnp.array(x) for x in zip(*of_ab, strict=True))
-        of_z, of_w = jnp.eye(len(z), len(near))[held], jnp.eye(len(near))[-1:] * (self.kind == ZERO)
-        L = jnp.concatenate([of_z, jnp.pad(jnp.concatenate([a, b], axis=1), ((0, 0), (len(z), 1))), of_w])
-        return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
-
-    def turned(self, X: Unknowns) -> Float[Array, "2 states"]:
-        """Return the columns of (a b) S(w)."""
-        (_, a, b, w), (of_w, fixed) = self.parts(X), np.reshape(SHAPES[self.kind], (2, 2, 2))
-        return (of_w * w + fixed).T @ jnp.stack([a, b])
-
-    def rows(self, values: Float[Array, "2 values *more"], turned: Float[Array, "2 states *more"]) -> Array:
-        """Return the rows of G or G_X, without those of L, from results of the program for a and for b."""
-        count = len(self.equations.rows)
-        R, Fx, Cx = jnp.split(values, [count, count + len(self.equations.states)], axis=1)
-        return jnp.concatenate([R[0], *(Fx - turned), *Cx])
-
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
-        """Return the residual G of the equations."""
-        L, c = self.linear(near)
-        values = self.each(self.program.values, scene, X)
-        return jnp.concatenate([self.rows(values, self.turned(X)), L @ X - c])
-
-    def each(self, function: Callable, scene: Scene, X: Unknowns):
-        """Return results of a function of all arguments of the program, for a and for b."""
-        numbers = self.numbers(scene, X)
-        return jax.vmap(lambda x: function(jnp.append(numbers, x)))(jnp.stack(self.parts(X)[1:3]))
+        """Return the residual G of the equations. Size and phase of a and b are those of the point `near`, up
+        to the second order.
+        """
+        (z, a, b, w), (_, a0, b0, _), of = self.parts(X), self.parts(near), self.equations
+        numbers, x = self.numbers(scene, X), jnp.stack([a, b])
+        values = jax.vmap(lambda x: self.program.values(jnp.append(numbers, x)))(x)
+        R, Fx, Cx = jnp.split(values, [len(of.rows), len(of.rows) + len(of.states)], axis=1)
+        of_w, fixed = np.reshape(SHAPES[self.kind], (2, 2, 2))
+        chosen = {  # for a zero eigenvalue, b is zero unless steady motions continue at the same parameters
+            PAIR: [a0 @ (a - a0) + b0 @ (b - b0), a0 @ b - b0 @ a],
+            DOUBLE: [a0 @ (a - a0), a0 @ b],
+            ZERO: [a0 @ (a - a0), b0 @ a, a0 @ b, b0 @ (b - b0), w[0]],
+        }[self.kind]
+        held = (z - self.parts(self.X)[0])[of.held]
+        return jnp.concatenate([R[0], *(Fx - (of_w * w + fixed).T @ x), *Cx, held, jnp.stack(chosen)])
 
     def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
         """Return the Jacobian and the residual, (G_X, G), as one matrix."""
-        (L, c), (values, D, _) = self.linear(near), self.each(self.program.of, scene, X)
-        of_z, of_x = jnp.split(D, [len(self.equations.places)], axis=2)
-        of_ab = jnp.einsum("kij,kl->kilj", of_x, jnp.eye(2)).reshape(*of_x.shape[:2], -1)
-        slopes = jnp.concatenate([of_z * self.equations.size, of_ab, jnp.zeros((*of_x.shape[:2], 1))], axis=2)
-        J, G = self.rows(slopes, jax.jacfwd(self.turned)(X)), self.rows(values, self.turned(X))
-        return jnp.column_stack([jnp.concatenate([J, L]), jnp.concatenate([G, L @ X - c])])
+        G, slope = jax.linearize(lambda X: self.equations_at(scene, X, near), X)
+        return jnp.column_stack([jax.vmap(slope, out_axes=1)(jnp.eye(len(X))), G])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
         """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""
@@ -269,11 +237,8 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 def _in_blocks(count: int, of_samples: list, *batch):
     """Follow few samples together, because the number of steps differs between them."""
     moving, fixed = eqx.partition([*batch], of_samples)
-    # the last sample fills the last block
-    places = np.minimum(np.arange(count + -count % 8), count - 1).reshape(-1, 8)
-    one = lambda k: followed_to.fun(*eqx.combine(jax.tree.map(lambda x: x[k], moving), fixed))
-    found = jax.lax.map(jax.vmap(one), jnp.asarray(places))
-    found = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:]))[:count], found)
+    one = lambda moving: followed_to.fun(*eqx.combine(moving, fixed))
+    found = jax.lax.map(one, moving, batch_size=8)
     return found, jax.tree.map(lambda _: True, found)
 
 

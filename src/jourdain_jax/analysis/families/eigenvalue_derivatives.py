@@ -77,10 +77,11 @@ def sensitivities(
     y = y / (y @ x)
 
     program, numbers, zero = program_of(equations), equations.at(z), np.zeros(len(look.R), complex)
+    no_C = np.zeros(len(equations.of_states))
 
     def pulled(x, of_rows, of_rates):
         """Return derivatives of `of_rows . R + of_rates . F x` with respect to all numbers."""
-        at, weights = np.concatenate([numbers, x]), np.concatenate([of_rows, of_rates])
+        at, weights = np.concatenate([numbers, x]), np.concatenate([of_rows, of_rates, no_C])
         real, imag = (np.asarray(program.pulled(at, part)) for part in (weights.real, weights.imag))
         return (real + 1j * imag)[: len(numbers)]
 
