@@ -2,19 +2,16 @@
 theorem.
 
     G(X, p) = 0,   dX = -G_X+ G_p dp,   X = (z, a, b, w)
-    G = ( R,  C a,  C b,  F (a b) - (a b) S(w),  size and phase of a and b )
+    G = ( R,  C a,  C b,  size and phase of a and b,  and one of: )
 
-    pair on the imaginary axis   F (a + i b) = i w (a + i b)
+    pair on the imaginary axis   F a = -w b,  F b = w a
     double root                  F a = w a,  F b = w b + a
     zero eigenvalue              F a = 0,  F b = 0, with b along the steady motions that continue at the same
                                  parameters
 
-R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue; S(w): the
-2 x 2 matrix of the three cases listed below G. One scalar program computes G and its derivatives. G has
-redundant but consistent rows. G_X has full column rank; its pseudo-inverse is computed by Q R.
-
-Equations of special points and their derivatives, as one scalar program. Eigenvalue derivatives use it,
-too.
+R, F, C, z: as in `equations.py`; a, b: vectors of small motions; w: a frequency or an eigenvalue. One scalar
+program computes R, F x and C x; eigenvalue derivatives use it, too. G has redundant but consistent rows. G_X
+has full column rank; its pseudo-inverse is computed by Q R.
 """
 
 from itertools import combinations
@@ -71,11 +68,6 @@ MEANINGS = (
     "not found: the point of the family cannot be followed to these parameters",
     "not a smooth function of the parameters here: eigenvalues or special points coincide",
 )
-SHAPES = {
-    PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)),
-    ZERO: ((0, 0, 0, 0),) * 2,
-    DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0)),
-}  # S = w (first) + (second), by rows
 
 
 class CriticalPoint(Printed, eqx.Module):
@@ -139,36 +131,26 @@ class Special(eqx.Module):
         to the second order.
         """
         (z, a, b, w), (_, a0, b0, _), of = self.parts(X), self.parts(near), self.equations
-        numbers, x = self.numbers(scene, X), jnp.stack([a, b])
-        values = jax.vmap(lambda x: self.program.values(jnp.append(numbers, x)))(x)
-        R, Fx, Cx = jnp.split(values, [len(of.rows), len(of.rows) + len(of.states)], axis=1)
-        of_w, fixed = np.reshape(SHAPES[self.kind], (2, 2, 2))
-        chosen = {  # for a zero eigenvalue, b is zero unless steady motions continue at the same parameters
-            PAIR: [a0 @ (a - a0) + b0 @ (b - b0), a0 @ b - b0 @ a],
-            DOUBLE: [a0 @ (a - a0), a0 @ b],
-            ZERO: [a0 @ (a - a0), b0 @ a, a0 @ b, b0 @ (b - b0), w[0]],
+        numbers, none = self.numbers(scene, X), jnp.zeros_like(a)
+        values = jax.vmap(lambda x: self.program.values(jnp.append(numbers, x)))(jnp.stack([a, b]))
+        R, F, C = jnp.split(values, [len(of.rows), len(of.rows) + len(of.states)], axis=1)
+        F_a, F_b, chosen = {
+            PAIR: (-w * b, w * a, [a0 @ (a - a0) + b0 @ (b - b0), a0 @ b - b0 @ a]),
+            DOUBLE: (w * a, w * b + a, [a0 @ (a - a0), a0 @ b]),
+            # b is zero unless steady motions continue at the same parameters
+            ZERO: (none, none, [a0 @ (a - a0), b0 @ a, a0 @ b, b0 @ (b - b0), w[0]]),
         }[self.kind]
         held = (z - self.parts(self.X)[0])[of.held]
-        return jnp.concatenate([R[0], *(Fx - (of_w * w + fixed).T @ x), *Cx, held, jnp.stack(chosen)])
+        return jnp.concatenate([R[0], F[0] - F_a, F[1] - F_b, *C, held, jnp.stack(chosen)])
 
-    def linearised(self, scene: Scene, X: Unknowns, near: Unknowns) -> Float[Array, "rows columns"]:
-        """Return the Jacobian and the residual, (G_X, G), as one matrix."""
-        G, slope = jax.linearize(lambda X: self.equations_at(scene, X, near), X)
-        return jnp.column_stack([jax.vmap(slope, out_axes=1)(jnp.eye(len(X))), G])
-
-    def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> Unknowns:
-        """Return the Gauss-Newton step, from the triangular factor of (G_X, G), whose last column is Q' G."""
-        T = jnp.linalg.qr(self.linearised(scene, X, near), mode="r")
-        return jax.scipy.linalg.solve_triangular(T[:-1, :-1], T[:-1, -1])
-
-    def inverse(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
+    def newton_step(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
         """Return the Gauss-Newton step, the pseudo-inverse of G_X, and the ratio of its smallest to its
         largest pivot.
         """
-        rows = self.linearised(scene, X, near)
-        Q, T = jnp.linalg.qr(rows[:, :-1])
+        G, slope = jax.linearize(lambda X: self.equations_at(scene, X, near), X)
+        Q, T = jnp.linalg.qr(jax.vmap(slope, out_axes=1)(jnp.eye(len(X))))
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
-        return inverse @ rows[:, -1], inverse, jnp.min(pivots) / jnp.max(pivots)
+        return inverse @ G, inverse, jnp.min(pivots) / jnp.max(pivots)
 
     def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
         """Return the point of a scene at X."""
@@ -214,7 +196,7 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
         there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
 
         def corrected(X, _):
-            change = special.correction(there, X, at.X)
+            change, *_ = special.newton_step(there, X, at.X)
             return X - change, largest(change)
 
         X, (first, second, third) = jax.lax.scan(corrected, at.X, length=3)
@@ -226,8 +208,8 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     goes_on = lambda at: ~at.found & (at.step > 1e-3) & (at.tries < 100)
     start = _Followed(special.X, jnp.array(0.0), jnp.array(1.0), jnp.array(0), jnp.array(False))
     found = jax.lax.while_loop(goes_on, once, start)
-    X = found.X - special.correction(scene, found.X, found.X)
-    change, inverse, condition = special.inverse(scene, X, found.X)
+    X = found.X - special.newton_step(scene, found.X, found.X)[0]
+    change, inverse, condition = special.newton_step(scene, X, found.X)
     known = found.found & (largest(change) < 1e-8)
     code = jnp.where(known, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
     return jnp.where(code == FOUND, X - change, jnp.nan), inverse, condition, code
@@ -291,7 +273,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     known = {
         point: [point.kind, *(point.modes if point.kind != DOUBLE else ())]
         for point in curve.changes
-        if point.kind in SHAPES
+        if point.kind in (PAIR, ZERO, DOUBLE)
     }
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
