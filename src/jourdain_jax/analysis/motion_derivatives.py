@@ -10,13 +10,12 @@ speeds enter only phi. Scenes without such a program use dense matrices.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Entries, Indices, array_module, real_type
@@ -92,18 +91,12 @@ class Sloped:
         matrix = np.zeros((0, 0), int) if matrix is None else matrix
         parts = [np.array(v, int), D, matrix, np.array(guards, int)]
         nodes = np.unique(np.concatenate([*map(np.ravel, parts)])).tolist()
-        self._which, self._parts = [np.searchsorted(nodes, part) for part in parts], (graph, nodes, given)
-        self.is_made = is_made(graph, nodes)
-        self._known = _evaluated(*self._parts)
-
-    @cached_property
-    def _traced(self) -> Callable[[Array], Array]:
-        return differentiable(*self._parts)
+        self._which = [np.searchsorted(nodes, part) for part in parts]
+        self._values, self.is_made = node_values(graph, nodes, given), not unsupported(graph, nodes)
 
     def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
         """Return v, D and the matrix, if there is one. All are NaN if a guard is not positive."""
-        xp = array_module(numbers)
-        found = (self._traced if xp is jnp else self._known)(numbers)
+        xp, found = array_module(numbers), self._values(numbers)
         *values, guards = (found[which] for which in self._which)
         v, D, matrix = (xp.where(xp.all(guards > 0), x, xp.nan) for x in values)
         return v, D, matrix
@@ -246,29 +239,16 @@ def _copied(
     return [[new[n] for n in part] for part in parts]
 
 
-def _evaluated(
-    graph: Graph, nodes: Sequence[int], variables: Sequence[int]
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from variables to values of nodes, by machine code if possible, else by NumPy."""
-    if jax.config.jax_enable_x64 and is_made(graph, nodes):
-        kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
-        return lambda given: np.asarray(kernel(given))
-    return lambda given: Probes(
-        graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True))
-    )(nodes)[:, 0]
-
-
-def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Return a function from variables to values of nodes that JAX can differentiate, by machine code if
-    possible, otherwise by XLA.
+def node_values(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Entries], Entries]:
+    """Return a function from variables to values of nodes, which JAX can differentiate: by machine code if
+    possible, otherwise known numbers by NumPy and traced ones by XLA.
     """
-    if is_made(graph, nodes):
-        return values_of_nodes(graph, nodes, variables)
-    return lambda x: jnp.stack(
-        [jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))]
-    )
-
-
-def is_made(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Return whether the nodes can be compiled to machine code."""
-    return not ffi.reason_against() and not unsupported(graph, nodes)
+    if jax.config.jax_enable_x64 and not (ffi.reason_against() or unsupported(graph, nodes)):
+        traced = values_of_nodes(graph, nodes, variables)
+        known = jax.jit(nodes_called(graph, nodes, variables, effort=0))
+    else:
+        named = lambda x: dict(zip(variables, x, strict=True))
+        traced = lambda x: jnp.stack([jnp.asarray(y, x.dtype) for y in run(graph, nodes, named(x))])
+        inputs = [graph.value[n] for n in variables]
+        known = lambda x: Probes(graph, dict(zip(inputs, x[:, None], strict=True)))(nodes)[:, 0]
+    return lambda x: traced(x) if array_module(x) is jnp else np.asarray(known(x))

@@ -14,6 +14,8 @@ program computes R, F x and C x; eigenvalue derivatives use it, too. G has redun
 has full column rank; its pseudo-inverse is computed by Q R.
 """
 
+from collections.abc import Callable
+from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
@@ -25,7 +27,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, SteadyEquations, null_space
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
-from jourdain_jax.analysis.motion_derivatives import ByProgram, differentiable
+from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, node_values
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, largest, static
 from jourdain_jax.integrate.state_projection import State, state_of
@@ -42,18 +44,23 @@ class SpecialProgram:
     """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[Indices, ...]) -> None:
-        graph, (rows, rates, states, of_states) = instant.graph, of
+        graph, (rows, rates, states, of_states, places) = instant.graph, of
         x = [graph.input(f"special {k}", True) for k in range(len(states))]
         moved, at = [instant.v[k] for k in (*rates, *of_states)], [instant.columns[k] for k in states]
         nodes = [instant.v[k] for k in rows] + derivatives(graph, moved, dict(zip(at, x, strict=True)))
-        self.values = differentiable(graph, nodes, [*instant.given, *x])
-        self.pulled = jax.jit(
-            lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, len(nodes) - len(w))))[0]
-        )
+        given, unknowns = [*instant.given, *x], [*(instant.given[k] for k in places), *x]
+        self.values = node_values(graph, nodes, given)
+        self.pulled = jax.jit(lambda at, w: jax.vjp(self.values, at)[1](w)[0])
+        self.sloped = lambda: Sloped(graph, nodes, unknowns, given, instant.guards)
+
+    @cached_property
+    def of(self) -> Sloped:
+        """Return the function that computes R, F x, C x and their derivatives with respect to z and x."""
+        return self.sloped()
 
 
 def program_of(equations: SteadyEquations) -> SpecialProgram:
-    of = equations.rows, equations.rates, equations.states, equations.of_states
+    of = equations.rows, equations.rates, equations.states, equations.of_states, equations.places
     return _kept_program(equations.scene, equations.instant, tuple(tuple(part.tolist()) for part in of))
 
 
@@ -126,19 +133,26 @@ class Special(eqx.Module):
         known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
         return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
+    def each(self, function: Callable, scene: Scene, X: Unknowns):
+        """Return results of a function of all arguments of the program, for a and for b."""
+        numbers = self.numbers(scene, X)
+        return jax.vmap(lambda x: function(jnp.append(numbers, x)))(jnp.stack(self.parts(X)[1:3]))
+
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
-        """Return the residual G of the equations. Size and phase of a and b are those of the point `near`, up
-        to the second order.
+        """Return the residual G of the equations."""
+        return self.rows(X, near, self.each(self.program.values, scene, X))
+
+    def rows(self, X: Unknowns, near: Unknowns, values: Float[Array, "2 values"]) -> Array:
+        """Return the residual G from results of the program for a and for b. Size and phase of a and b are
+        those of the point `near`, up to the second order.
         """
         (z, a, b, w), (_, a0, b0, _), of = self.parts(X), self.parts(near), self.equations
-        numbers, none = self.numbers(scene, X), jnp.zeros_like(a)
-        values = jax.vmap(lambda x: self.program.values(jnp.append(numbers, x)))(jnp.stack([a, b]))
         R, F, C = jnp.split(values, [len(of.rows), len(of.rows) + len(of.states)], axis=1)
         F_a, F_b, chosen = {
             PAIR: (-w * b, w * a, [a0 @ (a - a0) + b0 @ (b - b0), a0 @ b - b0 @ a]),
             DOUBLE: (w * a, w * b + a, [a0 @ (a - a0), a0 @ b]),
             # b is zero unless steady motions continue at the same parameters
-            ZERO: (none, none, [a0 @ (a - a0), b0 @ a, a0 @ b, b0 @ (b - b0), w[0]]),
+            ZERO: (0 * a, 0 * b, [a0 @ (a - a0), b0 @ a, a0 @ b, b0 @ (b - b0), w[0]]),
         }[self.kind]
         held = (z - self.parts(self.X)[0])[of.held]
         return jnp.concatenate([R[0], F[0] - F_a, F[1] - F_b, *C, held, jnp.stack(chosen)])
@@ -147,7 +161,14 @@ class Special(eqx.Module):
         """Return the Gauss-Newton step, the pseudo-inverse of G_X, and the ratio of its smallest to its
         largest pivot.
         """
-        G, slope = jax.linearize(lambda X: self.equations_at(scene, X, near), X)
+        values, D, _ = self.each(self.program.of, scene, X)
+
+        def linear(dX):
+            z, a, b, _ = self.parts(dX)
+            along = [D_x @ jnp.append(z * self.equations.size, x) for D_x, x in zip(D, (a, b), strict=True)]
+            return self.rows(X + dX, near, values + jnp.stack(along))
+
+        G, slope = jax.linearize(linear, jnp.zeros_like(X))
         Q, T = jnp.linalg.qr(jax.vmap(slope, out_axes=1)(jnp.eye(len(X))))
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
         return inverse @ G, inverse, jnp.min(pivots) / jnp.max(pivots)
