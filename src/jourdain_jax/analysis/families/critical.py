@@ -30,7 +30,7 @@ from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.motion_derivatives import ByProgram, Sloped, node_values
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Count, Flag, Indices, Scalar, largest, static
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_class
@@ -175,10 +175,10 @@ class Special(eqx.Module):
 
     def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
         """Return the point of a scene at X."""
-        of, w = self.equations, self.parts(X)[-1][0]
-        q, u, varied = of.split(self.numbers(scene, X))
+        of, w, numbers = self.equations, self.parts(X)[-1][0], self.numbers(scene, X)
+        varied = {name: numbers[of.by_name[name]] for name in of.vary}
         eigenvalue = jax.lax.complex(*((0 * w, w) if self.kind == PAIR else (w, 0 * w)))
-        return CriticalPoint(state_of(scene, of.t, q, u), varied, eigenvalue, condition, code, self.kind)
+        return CriticalPoint(of.state(numbers), varied, eigenvalue, condition, code, self.kind)
 
 
 @compiled_quickly

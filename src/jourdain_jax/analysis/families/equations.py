@@ -16,12 +16,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from jourdain_jax.analysis.motion_derivatives import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import Scalar, largest
+from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.coordinates import Labels, check_name
 from jourdain_jax.scene.scene import Scene, state_names
@@ -132,6 +134,12 @@ class Motions(ABC):
         numbers = self.at(z)
         return {name: float(numbers[k]) for name, k in self.by_name.items()}
 
+    def state(self, numbers, residual=0.0) -> State:
+        """Return the state among all numbers."""
+        entries = self.scene.coordinate_names.entries, self.scene.speed_names.entries
+        q, u = (jnp.asarray(numbers)[np.array([self.by_name[x] for x in names])] for names in entries)
+        return state_of(self.scene, self.t, q, u, residual=residual)
+
     def place(self, point) -> Vector:
         """Return the vector z of the unknowns for the values in `point`."""
         return np.array([point[name] for name in self.unknowns]) / self.size
@@ -226,15 +234,6 @@ class SteadyEquations(Motions):
         P = null_space(np.linalg.qr(E.T @ freedoms)[0].T)
         values = np.linalg.eigvals(P.T @ E.T @ F @ E @ P).astype(complex)
         return values[np.lexsort((-values.imag, values.real))]
-
-    def split(self, numbers):
-        """Return q, u, and the varying quantities by name."""
-        first, n, m = self.instant.states
-        return (
-            numbers[first : first + n],
-            numbers[first + n : first + n + m],
-            {name: numbers[self.by_name[name]] for name in self.vary},
-        )
 
 
 def numbered(scene: Scene) -> Scene:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
@@ -15,7 +14,7 @@ from jourdain_jax.analysis.families.special_points import SURE, across, first_po
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.scene.arguments import (
     BuiltFor,
     as_input_vector,
@@ -139,25 +138,19 @@ class Family(Printed):
         ((name, value),) = named.items()
         k = self.equations.index(name)
         past = lambda p: p.z[k] - float(value) / self.equations.size[k]
-        found = [
-            located(self.equations, here, there, past)
-            for here, there in pairwise(self.points)
-            if past(here) * past(there) < 0
-        ]
-        exact = [
-            point for point in self.points[: -1 if self.ends[1] == CLOSED else None] if past(point) == 0.0
-        ]
-        return tuple(self.point(point) for point in (*exact, *found) if point)
+        last = () if self.ends[1] == CLOSED else self.points[-1:]
+        found = (
+            here if past(here) == 0 else located(self.equations, here, there, past)
+            for here, there in pairwise((*self.points, *last))
+            if past(here) == 0 or past(here) * past(there) < 0
+        )
+        return tuple(self.point(point) for point in found if point)
 
     def point(self, point: Point, kind: str = "", columns: Indices = ()) -> FamilyPoint:
         """Return a point of the curve as a `FamilyPoint`. `columns`: indices of its `modes`."""
-        known = self.equations
-        values = known.values(point.z)
-        entries = (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
-        q, u = (jnp.array([values[name] for name in names]) for names in entries)
-        state = state_of(known.scene, known.t, q, u, residual=largest(point.look.R))
-        modes, tangent = tuple(self.mode_names[k] for k in columns), point.tangent * known.size
-        return FamilyPoint(kind, state, point.modes, modes, values, tangent, known.modes)
+        known, modes = self.equations, tuple(self.mode_names[k] for k in columns)
+        state, values = known.state(known.at(point.z), largest(point.look.R)), known.values(point.z)
+        return FamilyPoint(kind, state, point.modes, modes, values, point.tangent * known.size, known.modes)
 
     def to_xarray(self):
         """Return all points as an `xarray.Dataset`: unknowns, `stable`, and eigenvalues with mode names."""
@@ -174,15 +167,9 @@ class Family(Printed):
 
     def _text(self) -> str:
         known, ends = self.equations, self.ends
-        moved = {
-            name: float(np.ptp(self[name])) / size
-            for name, size in zip(known.unknowns, known.size, strict=True)
-        }
-        shown = [
-            name
-            for name in dict.fromkeys((*known.vary, *known.unknowns))
-            if moved[name] > SHOWN and " in piece " not in name
-        ][:8]
+        least = dict(zip(known.unknowns, SHOWN * known.size, strict=True))
+        names = dict.fromkeys((*known.vary, *known.unknowns))
+        shown = [x for x in names if np.ptp(self[x]) > least[x] and " in piece " not in x][:8]
         lines = [
             f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, "
             f"{int(self.stable.sum())} of them stable"
@@ -194,23 +181,12 @@ class Family(Printed):
             *self.special,
             self.point(self.points[-1], "last point"),
         ]
-        least = dict(zip(known.unknowns, SHOWN * known.size, strict=True))
         for point in points:
-            values = in_digits(
-                np.array([0.0 if abs(point[name]) < least[name] else point[name] for name in shown])
-            )
+            values = in_digits([0.0 if abs(point[x]) < least[x] else point[x] for x in shown])
             rows.append((point.kind, *values, ", ".join(dict.fromkeys(point.modes))))
-        eigenvalues = zip(self.mode_names, complex_numbers(self.points[0].modes), strict=True)
-        return "\n".join(
-            [
-                *lines,
-                *table(rows),
-                (
-                    f"  {known.modes}, at the first point: "
-                    f"{', '.join(f'{name} {value}' for name, value in eigenvalues)}"
-                ),
-            ]
-        )
+        eigenvalues = map(" ".join, zip(self.mode_names, complex_numbers(self.points[0].modes), strict=True))
+        last = f"  {known.modes}, at the first point: {', '.join(eigenvalues)}"
+        return "\n".join([*lines, *table(rows), last])
 
 
 @of_known_numbers
@@ -285,19 +261,13 @@ def family(
         equations = SteadyEquations(
             scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held
         )
-    known = {
-        name: checked_known(
-            value, f"`until` of `{name}`", (), advice="give the value at which the curve ends"
-        )
-        for name, value in until.items()
-    }
-    if not_numbers := [name for name, value in known.items() if not np.isfinite(value)]:
-        raise ValueError(
-            f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite number"
-        )
-    targets = [
-        (k := equations.index(name), float(value) / equations.size[k]) for name, value in known.items()
-    ]
+    targets = []
+    for name, value in until.items():
+        what = f"`until` of `{name}`"
+        target = float(checked_known(value, what, (), advice="give the value at which the curve ends"))
+        if not np.isfinite(target):
+            raise ValueError(f"{what} is {value}, expected a finite number")
+        targets.append((k := equations.index(name), target / equations.size[k]))
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:
         begin = first_point(equations, named, [*until])
@@ -313,9 +283,5 @@ def family(
     labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)
     found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, labels)
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}
-    return replace(
-        found,
-        special=tuple(
-            found.point(at, test.kind, test.columns) for test, at in special(equations, found.points, turning)
-        ),
-    )
+    at = special(equations, found.points, turning)
+    return replace(found, special=tuple(found.point(point, test.kind, test.columns) for test, point in at))
