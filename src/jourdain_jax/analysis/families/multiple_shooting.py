@@ -30,6 +30,7 @@ class Shooting(eqx.Module):
     """
 
     scene: Scene
+    t: Scalar  # s, at the start
     inputs: Inputs
     options: AllOptions
     shift: States  # given change per period
@@ -63,10 +64,10 @@ class Shooting(eqx.Module):
             self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options
         ).nan_if_failed()
 
-    def moved(self, k, z: States, t, period) -> States:
+    def moved(self, k, z: States, period) -> States:
         """Return f_k, the state at the end of piece k."""
-        part = period / self.pieces
-        motion = self.motion(t + k * part, z, (t + (k + 1) * part)[None])
+        start, end = (self.t + i * period / self.pieces for i in (k, k + 1))
+        motion = self.motion(start, z, end[None])
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     def events(self, t, z: States) -> Float[Array, "events"]:
@@ -91,65 +92,57 @@ class Shooting(eqx.Module):
         """Return the states at the starts of pieces, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
-    def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> PerRow:
+    def rows(self, x: Unknowns, ends: Float[Array, "pieces states"]) -> PerRow:
         """Return the residual R for pieces that end at `ends`, each entry divided by the size of its
         quantity.
         """
         zs, _ = self.pieces_of(x)
         there = jnp.roll(zs, -1, axis=0)
         changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
-        found = [self.constraints(t, zs[0])[0], jnp.ravel(changes[:-1]), changes[-1][np.array(self.kept)]]
-        return jnp.concatenate(
-            [*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])]
-        )
+        found = [
+            self.constraints(self.t, zs[0])[0],
+            jnp.ravel(changes[:-1]),
+            changes[-1][np.array(self.kept)],
+        ]
+        if self.until is not None:
+            found.append(self.events(self.t, zs[0])[self.until][None])
+        return jnp.concatenate(found)
 
-    def ends(self, t, x: Unknowns) -> Float[Array, "pieces states"]:
+    def ends(self, x: Unknowns) -> Float[Array, "pieces states"]:
         """Return the states f_k at the ends of all pieces."""
         zs, period = self.pieces_of(x)
-        return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
+        return jax.vmap(self.moved, (0, 0, None))(jnp.arange(self.pieces), zs, period)
 
-    def slopes(self, t, x: Unknowns) -> tuple[Array, Array, Array]:
-        """Return the derivatives of all end states f_k with respect to the start states z_k and the period T,
-        and f_k.
-        """
-        zs, period = self.pieces_of(x)
-
-        def of_piece(k, z):
-            def end(z, period):
-                return (found := self.moved(k, z, t, period)), found
-
-            (D, of_period), found = jax.jacfwd(end, (0, 1), has_aux=True)(z, period)
-            return D, of_period, found
-
-        return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
-
-    def look(self, t, x: Unknowns) -> tuple[Array, Array, tuple[Array, Array]]:
+    def look(self, x: Unknowns) -> tuple[Array, Array, tuple[Array, Array]]:
         """Return the residual R, its Jacobian dR/dx, and df_k/dz_k with f_k."""
-        D, of_period, ends = self.slopes(t, x)
+        zs, period = self.pieces_of(x)
+        twice = lambda *of: (self.moved(*of),) * 2
+        of_piece = jax.vmap(jax.jacfwd(twice, (1, 2), has_aux=True), (0, 0, None))
+        (D, of_period), ends = of_piece(jnp.arange(self.pieces), zs, period)
 
         def linear(change):
             dz, dT = self.pieces_of(change)
-            return self.rows(t, x + change, ends + jnp.einsum("kij,kj->ki", D, dz) + of_period * dT)
+            return self.rows(x + change, ends + jnp.einsum("kij,kj->ki", D, dz) + of_period * dT)
 
-        return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
+        return self.rows(x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(
-        self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends
+        self, x: Unknowns, D: Float[Array, "pieces states states"], ends
     ) -> Complex[Array, "multipliers"]:
         """Return the eigenvalues of the product M_n .. M_1, largest first, from df_k/dz_k and f_k. If the
         period is unknown, the eigenvalue 1 of the perturbation along the orbit is omitted.
         """
-        zs, period = self.pieces_of(x)
-        kept = np.array(self.kept)
-        known = structure_of(self.scene)
-        n = self.pieces
+        (zs, period), n = self.pieces_of(x), self.pieces
+        kept, known = np.array(self.kept), structure_of(self.scene)
         places = kept[kept < len(self.scene.coordinate_names.entries)]
         rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
         count = len(places) - int(rank) + known.degrees_of_freedom
         there = jnp.roll(zs, -1, axis=0)
         signs = jax.vmap(jax.jacfwd(self.aligned))(ends, there)
         D = (signs @ D)[:, kept][:, :, kept]
-        C = jax.vmap(lambda k, z: self.constraints(t + k * period / n, z)[1])(jnp.arange(n), zs)[:, :, kept]
+        C = jax.vmap(lambda k, z: self.constraints(self.t + k * period / n, z)[1])(jnp.arange(n), zs)[
+            :, :, kept
+        ]
         B = jax.vmap(null_space_svd)(C)[:, :, len(kept) - count :]
         L = jax.lax.stop_gradient(jnp.swapaxes(B, 1, 2))
         L, following = jnp.roll(L, -1, axis=0), jnp.roll(B, -1, axis=0)

@@ -189,24 +189,26 @@ def periodic(
     shifts = (checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names)
     shifted = jnp.stack([*shifts]).astype(start.q.dtype)
     event = None if until is None else events.index(until)
-    problem = Shooting(scene, inputs, options, shifted, instant, pieces, event, kept, free, tuple(shift))
+    problem = Shooting(
+        scene, start.t, inputs, options, shifted, instant, pieces, event, kept, free, tuple(shift)
+    )
     return _found(problem, start, period.astype(start.q.dtype))
 
 
 @compiled_quickly
 def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
-    t, begun = start.t, jnp.concatenate([start.q, start.u])
+    t, begun = problem.t, jnp.concatenate([start.q, start.u])
     still, z, given = jax.lax.stop_gradient((problem, begun, period))
     motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)
     zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
     guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
     size = jnp.where(problem.is_unknown, jnp.append(jnp.tile(problem.sizes, problem.pieces), given), 0.0)
-    rows = lambda x: problem.rows(t, x, problem.ends(t, x))
+    rows = lambda x: problem.rows(x, problem.ends(x))
     tolerance = 10.0 * jnp.asarray(problem.options.rtol)
-    x = smooth_root(lambda x: still.look(t, x)[:2], rows, guess, held, size, tolerance, 1e-9)
+    x = smooth_root(lambda x: still.look(x)[:2], rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
-    D, _, ends = problem.slopes(t, x)
-    residual = largest(problem.rows(t, x, ends))
+    R, _, (D, ends) = problem.look(x)
+    residual = largest(R)
     others = [k for k in range(len(names_of_events(problem.scene))) if k != problem.until]
     goes_on = jnp.array(True)
     if others:
@@ -220,7 +222,7 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
         if k not in problem.kept or name in problem.shifted
     }
     state = state_of(problem.scene, t, *problem.split(zs[0]), start.moved_q, start.moved_u, residual)
-    multipliers, converged = problem.multipliers(t, x, D, ends), (residual < 1e-8) & goes_on
+    multipliers, converged = problem.multipliers(x, D, ends), (residual < 1e-8) & goes_on
     return PeriodicMotion(state, period, shifts, multipliers, residual, converged, problem, x)
 
 
@@ -251,7 +253,7 @@ class OrbitEquations(Motions):
 
     def __call__(self, z: Vector) -> Look:
         """Return the equations, their derivatives and the multipliers at z."""
-        R, J, multipliers = map(np.asarray, _looked(self.problem, self.vary, self.t, self.at(z)))
+        R, J, multipliers = map(np.asarray, _looked(self.problem, self.vary, self.at(z)))
         return self.with_held(R, J[:, self.places], z, (multipliers,))
 
     @staticmethod
@@ -261,12 +263,12 @@ class OrbitEquations(Motions):
 
 
 @compiled_quickly
-def _looked(problem: Shooting, vary: Labels, t, numbers: Unknowns) -> tuple[Array, Array, Array]:
+def _looked(problem: Shooting, vary: Labels, numbers: Unknowns) -> tuple[Array, Array, Array]:
     """Return R, its derivatives with respect to all numbers, and the multipliers."""
     x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
     moved = lambda values: replace(
         problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True)))
     )
-    R, J, (D, ends) = moved(parameters).look(t, x)
-    by_parameters = jax.jacfwd(lambda values: moved(values).rows(t, x, moved(values).ends(t, x)))(parameters)
-    return R, jnp.concatenate([J, by_parameters], axis=1), moved(parameters).multipliers(t, x, D, ends)
+    R, J, (D, ends) = moved(parameters).look(x)
+    by_parameters = jax.jacfwd(lambda values: moved(values).rows(x, moved(values).ends(x)))(parameters)
+    return R, jnp.concatenate([J, by_parameters], axis=1), moved(parameters).multipliers(x, D, ends)
