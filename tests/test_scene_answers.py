@@ -47,7 +47,7 @@ def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_
         jj.accelerations(tilted.replace(mass=1.5), 0.0, np.zeros(2), np.zeros(2))
     (failed,) = [check for check in jj.verify(tilted.replace(mass=1.5)).checks if check.name == "inertia"]
     assert not failed.passed
-    assert failed.culprit == "load 1 (on `bead`): its direction is not a unit vector"
+    assert failed.culprit == "the direction of gravity in load 1 is not a unit vector"
 
 
 def test_a_direction_of_gravity_that_is_traced_hides_nothing_else():

@@ -99,16 +99,14 @@ class Linearization(Printed, eqx.Module):
             f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), "
             f"pivot {float(self.pivot):.2g}"
         ]
-        names = self.coordinates
+        names, states = self.coordinates, self.states
+        shown = dict.fromkeys("MCK", names) | {"F": self.inputs}
+        if not names:
+            shown = {"A": states, "B": self.inputs}
+        for what, columns in shown.items():
+            lines += matrix(what, getattr(self, what), names or states, columns) if columns else []
         if names:
-            lines += [
-                line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)
-            ]
-            lines += matrix("F", self.F, names, self.inputs) if self.inputs else []
             lines.append(f"  coupling to other coordinates {float(self.coupling):.1e}")
-        else:
-            lines += matrix("A", self.A, self.states, self.states)
-            lines += matrix("B", self.B, self.states, self.inputs) if self.inputs else []
         values = complex_numbers(self.eigenvalues() if names else self.state_eigenvalues())
         return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(values)])
 

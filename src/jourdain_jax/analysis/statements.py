@@ -36,10 +36,11 @@ from jourdain_jax.equations.virtual_power import equations_and_rows, on_speeds, 
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Labels
-from jourdain_jax.scene.loads import Gravity, Load
+from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.user_methods import loads_of, potential_of
+from jourdain_jax.structure.scene_numbers import stated_of
 from jourdain_jax.structure.structure import plain_row_lengths, usual_rows
 
 
@@ -193,44 +194,27 @@ def statement_checks(
 @eval_numpy
 def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
     motion = motion_at(scene, t, q, u, inputs)
-    return _inertia(motion) | _gravity(scene, motion), _potentials(scene, motion, Z)
+    return _inertia(scene, motion), _potentials(scene, motion, Z)
 
 
-def _inertia(motion: Motion) -> dict[str, Scalar]:
-    values = {}
-    for name, moving in motion.bodies.items():
-        body = moving.body
-        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(
-            jnp.abs(body.mass), tiny_of(body.mass)
+def _inertia(scene: Scene, motion: Motion) -> dict[str, Scalar]:
+    stated, values = stated_of(scene, motion.pose(), loads_of(scene, motion)), {}
+    for name, mass in stated["mass"].items():
+        values[f"{name}: its mass is negative"] = jnp.maximum(-mass, 0.0) / jnp.maximum(
+            jnp.abs(mass), tiny_of(mass)
         )
-        if not isinstance(body, RigidBody):
-            continue
-        size = largest(body.inertia) + tiny_of(body.inertia)
-        moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
-        values[f"body `{name}`: its inertia is not symmetric"] = largest(body.inertia - body.inertia.T) / size
-        values[f"body `{name}`: a principal moment of inertia is negative"] = (
-            jnp.maximum(-moments[0], 0.0) / size
-        )
-        excess = jnp.where(moments[0] >= 0, jnp.maximum(moments[2] - moments[0] - moments[1], 0.0), 0.0)
-        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = (
-            excess / size
-        )
-        values[f"body `{name}`: its orientation is not a rotation matrix"] = largest(
-            body.orientation.T @ body.orientation - jnp.eye(3)
-        )
-    return values
-
-
-def _gravity(scene: Scene, motion: Motion) -> dict[str, Scalar]:
-    directions = {
-        _name(i, load): load.direction
-        for i, load in enumerate(loads_of(scene, motion))
-        if isinstance(load, Gravity)
-    }
-    return {
-        f"{name}: its direction is not a unit vector": jnp.abs(jnp.linalg.norm(e) - 1)
-        for name, e in directions.items()
-    }
+    for name, rows in stated["inertia"].items():
+        inertia, R = rows[:3], stated["orientation"][name]
+        size, (low, middle, high) = largest(inertia) + tiny_of(inertia), jnp.linalg.eigvalsh(inertia)
+        excess = jnp.where(low >= 0, jnp.maximum(high - low - middle, 0.0), 0.0)
+        values |= {
+            f"{name}: its inertia is not symmetric": largest(inertia - inertia.T) / size,
+            f"{name}: a principal moment of inertia is negative": jnp.maximum(-low, 0.0) / size,
+            f"{name}: a principal moment of inertia exceeds the sum of the other two": excess / size,
+            f"{name}: its orientation is not a rotation matrix": largest(R.T @ R - jnp.eye(3)),
+        }
+    off = {name: jnp.abs(jnp.sqrt(square) - 1) for name, square in stated["gravity"].items()}
+    return values | {f"{name} is not a unit vector": size for name, size in off.items()}
 
 
 def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:

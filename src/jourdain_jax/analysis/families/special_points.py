@@ -165,18 +165,12 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
     while k < len(points) - 1:
         _, here, there = three = points[k - 1 : k + 2]
         at = tuple(float(here.tangent @ (point.z - here.z)) for point in three)
-        branch, *tests = (
-            (tuple(map(test.of, three)), test.least)
-            for test in tests_between(equations, here, there, turning)
-        )
-        beside = min(branch[0]) * max(branch[0]) < 0
-        s = (
-            None
-            if beside
-            else next((s for one in (branch, *tests) if (s := dip(at, *one)) is not None), None)
-        )
+        branch, *tests = tests_between(equations, here, there, turning)
+        places = (dip(at, tuple(map(test.of, three)), test.least) for test in (branch, *tests))
+        at_branch = min(map(branch.of, three)) * max(map(branch.of, three)) < 0
+        s = None if at_branch else next((s for s in places if s is not None), None)
         new = None if s is None else along(equations, here, s)
-        if s is None or new is None:
+        if new is None:
             k += 1
         else:
             points.insert(k + (s > 0), new)
