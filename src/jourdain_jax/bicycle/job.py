@@ -54,15 +54,6 @@ class Refused:
 
 
 @dataclass(frozen=True)
-class Rides:
-    """Three simulated rides with labels."""
-
-    labels: tuple[str, ...]
-    speeds: np.ndarray  # m/s
-    lanes: Rollout
-
-
-@dataclass(frozen=True)
 class Study:
     """Results for one bicycle."""
 
@@ -74,21 +65,22 @@ class Study:
     # (samples + 1, speeds, modes): first the measured bicycle; modes: castering, capsize, weave, weave
     eigenvalues: np.ndarray
     physical: np.ndarray  # whether each sample is a possible bicycle
-    rides: Rides
+    rides: dict[str, float]  # label -> speed (m/s) of each simulated ride
+    lanes: Rollout  # the rides
 
     def as_dict(self) -> dict:
         """Return one object of `result.json`."""
-        lanes = self.rides.lanes
+        lanes = [self.lanes.lane(i) for i in range(len(self.rides))]
         rides = [
             {
                 "label": label,
-                "speed": float(speed),
-                "stopped": int(lanes.result[i]) == EVENT,
-                "t_end": float(lanes.lanes.t_end[i]),
-                "lean_at_end": float(lanes.lanes.q_end[i, 3]),
-                "message": lanes.lane(i).message,
+                "speed": speed,
+                "stopped": int(lane.result) == EVENT,
+                "t_end": float(lane.t_end),
+                "lean_at_end": float(lane.q_end[3]),
+                "message": lane.message,
             }
-            for i, (label, speed) in enumerate(zip(self.rides.labels, self.rides.speeds, strict=True))
+            for lane, (label, speed) in zip(lanes, self.rides.items(), strict=True)
         ]
         return {
             "file": self.path,
@@ -118,6 +110,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
     grid = _speeds_to_draw(weave, capsize, float(found.double_root_speed[0]))
+    rides = ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))
     return Study(
         path=str(path),
         bicycle=bicycle,
@@ -128,7 +121,8 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
         grid=grid,
         eigenvalues=np.asarray(_modes(matrices, jnp.asarray(grid))),
         physical=physical,
-        rides=ride(bicycle.values, ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))),
+        rides=rides,
+        lanes=ride(bicycle.values, list(rides.values())),
     )
 
 
@@ -151,15 +145,13 @@ def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
     }
 
 
-def ride(values: dict[str, float], by_label: dict[str, float]) -> Rides:
+def ride(values: dict[str, float], speeds: list[float]) -> Rollout:
     """Simulate hands-free rides of the bicycle with these parameters: upright running with a kick in lean
     rate, until it falls.
     """
-    speeds = np.array(list(by_label.values()))
     bicycle = WhippleBicycle.from_values(values)
     kicked = jax.vmap(lambda speed: upright_running(bicycle, speed, 0.1))(jnp.asarray(speeds))
-    lanes = rollout(bicycle, kicked, ts=np.linspace(0.0, 6.0, 301), progress=False, work=False)
-    return Rides(tuple(by_label), speeds, lanes)
+    return rollout(bicycle, kicked, ts=np.linspace(0.0, 6.0, 301), progress=False, work=False)
 
 
 @compiled_quickly

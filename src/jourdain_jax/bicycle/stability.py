@@ -115,7 +115,10 @@ def eigenvalues(
     higher one capsize, and the pair is weave. The eigenvalue of a pair with negative frequency comes first.
     """
     matrices = _as_matrices(M, C1, K0, K2, g)
-    return jax.vmap(lambda v: _name_modes(_eigenvalues(matrices, v)))(jnp.asarray(speeds, matrices.g.dtype))
+    values = jax.vmap(lambda v: _eigenvalues(matrices, v))(jnp.asarray(speeds, matrices.g.dtype))
+    lowest, low, high, highest = (values.imag != 0).T
+    pair_between = low & high & ~lowest & ~highest
+    return jnp.where(pair_between[:, None], values[:, np.array([0, 3, 1, 2])], values)
 
 
 def _eigenvalues(matrices: BicycleMatrices, v: Scalar) -> Complex[Array, " 4"]:
@@ -173,13 +176,6 @@ def _speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
         stable_to=jnp.where(exists, ends[k + 1], jnp.nan),
         stable_range_exists=exists,
     )
-
-
-def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
-    """Return sorted eigenvalues in the order castering, capsize, weave, weave (see `eigenvalues`)."""
-    is_pair = values.imag != 0
-    pair_between = is_pair[1] & is_pair[2] & ~is_pair[0] & ~is_pair[3]
-    return jnp.where(pair_between, values[jnp.array([0, 3, 1, 2])], values)
 
 
 def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:

@@ -92,9 +92,8 @@ def _mark_range(study: Study, axes) -> None:
 
 def draw_rides(study: Study, path: FilePath) -> None:
     """Draw lean and steer over time for the three rides."""
-    rides = study.rides
-    lanes = [rides.lanes.lane(i) for i in range(len(rides.labels))]
-    labels = [f"{speed:.2f} m/s, {label}" for label, speed in zip(rides.labels, rides.speeds, strict=True)]
+    lanes = [study.lanes.lane(i) for i in range(len(study.rides))]
+    labels = [f"{speed:.2f} m/s, {label}" for label, speed in study.rides.items()]
     title = f"{study.bicycle.name}: hands-free after a kick in lean rate"
     figure, panels = pyplot().subplots(2, 1, sharex=True, figsize=(7.5, 5.5), layout="constrained")
     plot(
@@ -115,7 +114,6 @@ def draw_rides(study: Study, path: FilePath) -> None:
 
 def animate_ride(study: Study, path: FilePath) -> None:
     """Animate the first ride (below the stable range), with the view following the bicycle."""
-    rides = study.rides
-    lane = rides.lanes.lane(0)
-    title = f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}"
-    animate(lane, path, follow=True, paths=[], title=title)
+    label, speed = next(iter(study.rides.items()))
+    title = f"{study.bicycle.name} at {speed:.2f} m/s, {label}"
+    animate(study.lanes.lane(0), path, follow=True, paths=[], title=title)
