@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.analysis.motion_derivatives import places_of
+from jourdain_jax.analysis.motion_derivatives import places_of, steadiness
 from jourdain_jax.calculus.reals import (
     Entries,
     Indices,
@@ -193,7 +193,6 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
     (S, turned), constant = perturbations(scene.coordinates), at.udot[chosen]
-    change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
     # derivatives along all perturbations (ds, du, df); T: all perturbations from the independent ones
     along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
@@ -215,9 +214,9 @@ def matrices_of(scene: Scene, q, v, D, mass, independent: Labels, y: Indices, co
     A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
     second = _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates)
     found = dict(zip(("M", "C", "K", "F", "coupling"), second, strict=True))
-    found |= {"A": A, "B": B, "acceleration": largest(v[constant]), "pivot": xp.minimum(*pivots)}
-    found["residual"] = xp.maximum(found["acceleration"], largest(change))
-    found["followed"] = T
+    rates = steadiness(scene, v, D, constant)
+    found |= {"A": A, "B": B, "acceleration": rates[0], "residual": xp.maximum(*rates)}
+    found |= {"pivot": xp.minimum(*pivots), "followed": T}
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 

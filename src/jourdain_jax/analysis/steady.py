@@ -26,6 +26,7 @@ from jourdain_jax.analysis.motion_derivatives import (
     instant_of,
     on_rows,
     places_of,
+    steadiness,
     unseen,
 )
 from jourdain_jax.calculus.compilation import compiled_quickly
@@ -209,9 +210,8 @@ class _Problem(eqx.Module):
         y = at.udot[np.array(self.privileged, int)]
         of_rows = np.concatenate([at.g, at.phi])
         rows = np.concatenate([of_rows, y, at.qdot[np.array(self.resting, int)]])
-        along = jnp.concatenate([jnp.ones(1, v.dtype), v[at.qdot], v[at.udot], jnp.zeros(len(at.f), v.dtype)])
         slopes = D[rows][:, np.concatenate([at.q, at.u])]
-        return v[rows], slopes, [largest(v[of_rows]), largest(v[y]), largest(D[y] @ along)]
+        return v[rows], slopes, [largest(v[of_rows]), *steadiness(self.scene, v, D, y)]
 
 
 @compiled_quickly

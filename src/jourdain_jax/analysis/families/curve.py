@@ -94,18 +94,18 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
                     "no further point is found: the equations are undefined, or lose rank, beyond it",
                 )
             continue
-        points.append(there)
+        reason = ""
         for k, target in targets:
             past = lambda point, k=k, target=target: point.z[k] - target
             if past(here) * past(there) <= 0:
-                if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
-                    points[-1] = end
-                left = _left(equations, points[-1])
-                if left:
-                    return (points[:-1], left)
-                return (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
+                reason = f"{equations.unknowns[k]} is {target * equations.size[k]:g}"
+            if past(here) * past(there) < 0:
+                there = located(equations, here, there, past) or there
         if left := _left(equations, there):
-            return points[:-1], left
+            return points, left
+        points.append(there)
+        if reason:
+            return points, reason
         if _closed(equations, start, here, there):
             points.append(replace(start, modes=matched(there.modes, start.modes)))
             return points, CLOSED
