@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from jourdain_jax.analysis.motion_derivatives import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
@@ -51,15 +51,14 @@ def surely_matched(before: Modes, now: Modes) -> bool:
     """Return whether each eigenvalue moved by at most half of its distance to the nearest other eigenvalue.
     Its complex conjugate does not count as another.
     """
-    columns = range(len(now))
-    beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
+    beside = partners(before, now) | np.eye(len(now), dtype=bool)
     apart = np.where(beside, np.inf, np.abs(before[:, None] - before))
     return bool(np.all(np.abs(now - before) <= 0.5 * np.min(apart, axis=1, initial=np.inf)))
 
 
-def are_partners(before, now, k: int, j: int) -> bool:
-    """Return whether two columns are a complex conjugate pair before or now."""
-    return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
+def partners(before: Modes, now: Modes) -> Bool[np.ndarray, "modes modes"]:
+    """Return which columns are a complex conjugate pair before or now."""
+    return np.any([(v[:, None] == np.conj(v)) & (v.imag != 0) for v in (before, now)], axis=0)
 
 
 def mode_names(scene: Scene, names: Labels | None, values: Modes) -> Labels:

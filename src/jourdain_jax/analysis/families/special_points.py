@@ -14,7 +14,7 @@ Continue a curve of steady motions: find its start, its points, its ends and its
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from jourdain_jax.analysis.families.curve import (
     solved,
     traced,
 )
-from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector, are_partners
+from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector, partners
 from jourdain_jax.calculus.reals import all_finite, largest
 
 SURE = 1e-7  # numerics: real parts and differences of eigenvalues above SURE (1 + |s|) are not round-off
@@ -58,17 +58,15 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
     The position is the minimum of the parabola through the values `f` at three neighbours. Positions `at` are
     relative to the second neighbour.
     """
-    (before, _, after), (a, b, c) = at, f
-    if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
+    (before, _, after), (a, b, c) = at, map(abs, f)
+    if min(f) * max(f) <= 0 or min(a, b, c) <= least or not before < 0 < after:
         return None
     low, high = (a - b) / before, (c - b) / after
     curvature = (high - low) / (after - before)
     slope = low - curvature * before
-    s = -slope / (2 * curvature) if curvature * b > 0 else after
+    s = -slope / (2 * curvature) if curvature > 0 else after
     near = min(abs(s - x) for x in at) < 1e-4 * (after - before)
-    if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b):
-        return s
-    return None
+    return s if before < s < after and not near and b + slope * s / 2 < 0.02 * max(a, b, c) else None
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
@@ -89,20 +87,11 @@ def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[
     for k, s in enumerate(before):
         if s.imag >= 0 and (s.imag == 0) == (now[k].imag == 0):
             columns = tuple(np.flatnonzero(np.isin(before, (s, np.conj(s)))).tolist())
-            yield Test(
-                equations.crossing(s),
-                lambda p, k=k: float(equations.growth(p.modes)[k]),
-                SURE * (1 + abs(s)),
-                columns,
-            )
-    for a, b in combinations(range(len(before)), 2):
-        if are_partners(before, now, a, b):
-            yield Test(
-                DOUBLE,
-                lambda p, a=a, b=b: float(((p.modes[a] - p.modes[b]) ** 2).real),
-                (SURE * (1 + abs(before[a]))) ** 2,
-                (a, b),
-            )
+            growth = lambda p, k=k: float(equations.growth(p.modes)[k])
+            yield Test(equations.crossing(s), growth, SURE * (1 + abs(s)), columns)
+    for a, b in np.argwhere(np.triu(partners(before, now))).tolist():
+        square = lambda p, a=a, b=b: float(((p.modes[a] - p.modes[b]) ** 2).real)
+        yield Test(DOUBLE, square, (SURE * (1 + abs(before[a]))) ** 2, (a, b))
 
 
 def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
