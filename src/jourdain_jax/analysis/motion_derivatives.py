@@ -252,12 +252,14 @@ def node_values(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) ->
     """Return a function from variables to values of nodes, which JAX can differentiate: by machine code if
     possible, otherwise known numbers by NumPy and traced ones by XLA.
     """
-    if jax.config.jax_enable_x64 and not (ffi.reason_against() or unsupported(graph, nodes)):
+    if made := not (ffi.reason_against() or unsupported(graph, nodes)):
         traced = values_of_nodes(graph, nodes, variables)
-        known = jax.jit(nodes_called(graph, nodes, variables, effort=0))
     else:
         named = lambda x: dict(zip(variables, x, strict=True))
         traced = lambda x: jnp.stack([jnp.asarray(y, x.dtype) for y in run(graph, nodes, named(x))])
+    if made and jax.config.jax_enable_x64:
+        known = jax.jit(nodes_called(graph, nodes, variables, effort=0))
+    else:
         inputs = [graph.value[n] for n in variables]
         known = lambda x: Probes(graph, dict(zip(inputs, x[:, None], strict=True)))(nodes)[:, 0]
     return lambda x: traced(x) if array_module(x) is jnp else np.asarray(known(x))
