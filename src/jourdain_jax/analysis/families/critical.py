@@ -240,9 +240,11 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 def _in_blocks(count: int, of_samples: list, *batch):
     """Follow few samples together, because the number of steps differs between them."""
     moving, fixed = eqx.partition([*batch], of_samples)
+    # the last sample fills the last block, so that only whole blocks are compiled
+    places = np.minimum(np.arange(count + -count % 8), count - 1)
     one = lambda moving: followed_to.fun(*eqx.combine(moving, fixed))
-    found = jax.lax.map(one, moving, batch_size=8)
-    return found, jax.tree.map(lambda _: True, found)
+    found = jax.lax.map(one, jax.tree.map(lambda x: x[places], moving), batch_size=8)
+    return jax.tree.map(lambda x: x[:count], found), jax.tree.map(lambda _: True, found)
 
 
 # Without derivatives, JAX runs `followed_to` as a program of its own, which compiles quickly. The rule is
