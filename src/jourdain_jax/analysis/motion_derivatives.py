@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Entries, Indices, Scalar, array_module, largest, real_type
+from jourdain_jax.calculus.reals import Entries, Indices, array_module, largest, real_type
 from jourdain_jax.dynamics.accelerations import reduced_at
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
@@ -197,7 +197,7 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
     return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)
 
 
-def steadiness(scene: Scene, v, D, y: np.ndarray) -> tuple[Scalar, Scalar]:
+def steadiness(scene: Scene, v, D, y: np.ndarray) -> tuple:
     """Return the largest magnitudes of dy/dt and of d2y/dt2 along the motion; both are zero in a steady
     motion. `y`: places of the independent accelerations in v.
     """
