@@ -15,10 +15,10 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 474_287,
+    "code tokens of src": 473_423,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
-    "caches": 50,
+    "caches": 49,
     "named numbers": 296,
     "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,

@@ -188,10 +188,8 @@ def periodic(
     free = tuple(k for k in kept if names[k] not in held)
     shifts = (checked_real(shift.get(name, 0.0), f"`shift` of `{name}`", ()) for name in names)
     shifted = jnp.stack([*shifts]).astype(start.q.dtype)
-    event = None if until is None else events.index(until)
-    problem = Shooting(
-        scene, start.t, inputs, options, shifted, instant, pieces, event, kept, free, tuple(shift)
-    )
+    event, t = None if until is None else events.index(until), jnp.asarray(start.t)
+    problem = Shooting(scene, t, inputs, options, shifted, instant, pieces, event, kept, free, tuple(shift))
     return _found(problem, start, period.astype(start.q.dtype))
 
 
