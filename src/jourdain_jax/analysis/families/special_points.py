@@ -159,7 +159,7 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
         at_branch = min(map(branch.of, three)) * max(map(branch.of, three)) < 0
         s = None if at_branch else next((s for s in places if s is not None), None)
         new = None if s is None else along(equations, here, s)
-        if new is None:
+        if s is None or new is None:
             k += 1
         else:
             points.insert(k + (s > 0), new)
