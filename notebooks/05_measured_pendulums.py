@@ -145,7 +145,7 @@ def weave_speeds_of(values):
     return jax.vmap(lambda one: speeds_of_matrices(*linear_matrices(one)).weave_speed)(values)
 
 
-# it is run a few times: what it costs is its compilation
+# compilation dominates, since it runs only a few times
 weave_speeds = jax.jit(
     weave_speeds_of,
     compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},

@@ -278,7 +278,7 @@ FITS = {
     "jj.steady(disc, {'lean': 0.3}, held=('leen',))": "did you mean `lean`",
     "jj.steady(disc, {'lean': 0.3}, moving=('spinn',))": "did you mean `spin`",
     "gradients(('ofset',), start={'x_rate': jj.studies.Normal(0.5, 0.1)}, samples=8)": (
-        "`ofset` is no parameter of the scene; ... `offset`"
+        "`ofset` is not a parameter of the scene; ... `offset`"
     ),
     "gradients(('offset',), vary={'offset': jj.studies.Normal(0.25, 0.01)}, samples=8)": (
         "`offset` varies over the samples"
@@ -313,7 +313,7 @@ INERTIAS = {
         "a function for `moments` and the possible inertia"
     ),
     "inertia(moments=(0.1, 0.1, 0.3))": (
-        "no body of nonzero thickness has the moments of inertia of body ... 0.1, 0.1, 0.3 kg m"
+        "no body of nonzero thickness has the inertia of body ... 0.1, 0.1, 0.3 kg m"
     ),
     "inertia(lambda s: jnp.array([0.0, 0.0, 1.0]) * s.moments[0])": (
         "entry 11 of its inertia, 0 kg m ... , is not a parameter; give each parameter its own"

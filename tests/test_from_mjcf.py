@@ -329,7 +329,7 @@ BAD = {
     ),
     "no-class": (
         _body('<joint name="j" class="heavy"/>'),
-        r"joint `j` is of the class `heavy`, which no `default` states",
+        r"joint `j` has the class `heavy`, which no `default` defines",
     ),
     "default-without-class": (
         _body(HINGE, compiler="<default><default/></default>"),
@@ -369,7 +369,7 @@ BAD = {
     ),
     "renamed-main": (
         _body(HINGE, compiler='<default class="robot"><joint damping="3"/></default>'),
-        r"outermost `default` is of the class `robot`",
+        r"outermost `default` has the class `robot`",
     ),
     "axis-zero": (_body('<joint name="j" axis="0 0 0"/>'), r"axis of joint `j` is zero"),
 }

@@ -74,7 +74,7 @@ assert jj.simulate(disc, jj.start(disc, lean=0.3), t1=0.1).result == 0 and threa
 try:
     jj.configure()
 except RuntimeError as error:
-    assert "JAX has computed already" in str(error)
+    assert "JAX has already computed something" in str(error)
 else:
     raise AssertionError
 assert found.items() <= os.environ.items()

@@ -351,7 +351,7 @@ WRONG = {  # the code's text in a lane, the text of the error alone
         r"moments of inertia 0\.3, 0\.3 and 0\.7 kg m\^2, the last above",
     ),
     "stretch=2.0": (
-        "an orientation that is no rotation: body `wheel`",
+        "an orientation that is not a rotation: body `wheel`",
         "R' R differs from the identity by 3",
     ),
     "mirror=-1.0": ("a reflected orientation: body `wheel`", "orientation of determinant -1, a reflection"),
@@ -459,7 +459,7 @@ LED = {
     "slope": "a body off its ground: contact `rim`",
     "lift": "a body off its ground: contact `rim`",
     "swing": "a plane that contradicts its stated motion: the plane of contact `tip`",
-    "stretch": "an orientation that is no rotation: body `rod`",
+    "stretch": "an orientation that is not a rotation: body `rod`",
 }
 
 

@@ -164,11 +164,11 @@ def test_what_is_said_twice_is_refused(form):
             with pytest.raises(ValueError, match=r"two \w+s are called `"):
                 reader(twice)
     if form == "mjcf":
-        with pytest.raises(ValueError, match="two `default` are of the class `heavy`"):
+        with pytest.raises(ValueError, match="two `default` elements have the class `heavy`"):
             reader(text.replace("</default></default>", '</default><default class="heavy"/></default>'))
         with pytest.raises(ValueError, match="the text `3` in `joint` of the class `heavy` is not supported"):
             reader(text.replace('<joint damping="0.1"/>', "<joint>3</joint>"))
-        with pytest.raises(ValueError, match="the class `main` states `geom` twice"):
+        with pytest.raises(ValueError, match="the class `main` defines `geom` twice"):
             reader(text.replace('<geom density="500"/>', '<geom density="500"/><geom density="400"/>'))
 
 

@@ -311,7 +311,7 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     assert held.chi_square - found.chi_square == pytest.approx(3.841, rel=0.05)
     assert held["late.delay"].value < found["late.delay"].low
     assert found.warning.startswith(
-        "the interval of `late.delay` is too narrow: with `late.lag` off its bound"
+        "the interval of `late.delay` is too narrow: if `late.lag` leaves its bound"
     )
     assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))

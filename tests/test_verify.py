@@ -190,7 +190,7 @@ WRONG = {  # methods of the sledge, the check that must fail, and what it must n
     "a large product of inertia": inertia([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], NEGATIVE),
     "an inertia that is not a number": inertia([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]]),
     "a negative mass": (bead(-0.3, lambda x: x), "inertia", "body `bead`: its mass is negative"),
-    "an orientation that is no rotation": (
+    "an orientation that is not a rotation": (
         {"bodies": stretched},
         "inertia",
         "body `sledge`: its orientation is not a rotation matrix",

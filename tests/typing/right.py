@@ -1,11 +1,11 @@
 # mypy: disallow-untyped-defs, disallow-untyped-calls
+# pyright: strict
 """Code without a mistake, annotated throughout: strict checkers find nothing, and know what comes back."""
 
 from typing import Any, assert_type
 
-import jax.numpy as jnp
-
 import jourdain_jax as jj
+from jourdain_jax.analysis import Linearization, SteadyMotion
 from jourdain_jax.identification import Fit
 from jourdain_jax.studies import Normal, StudyResult
 
@@ -15,10 +15,9 @@ class Sleigh(jj.Scene):
     coordinates = jj.coordinates("x y heading")
 
     def bodies(self, t: Any, q: Any) -> dict[str, jj.RigidBody]:
+        position, orientation = jj.vec(q.x, q.y, 0), jj.rot_z(q.heading)
         return {
-            "sleigh": jj.RigidBody(
-                self.mass, jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading)
-            )
+            "sleigh": jj.RigidBody.rod(self.mass, 0.5, axis="x", position=position, orientation=orientation)
         }
 
 
@@ -34,3 +33,8 @@ assert_type(
 assert_type(
     jj.Study(scene, vary={"mass": Normal(1.0, 0.1)}, samples=8).run("study.zarr", t1=1.0), StudyResult
 )
+assert_type(jj.steady(scene, {"x_rate": 1.0}, held="x_rate"), SteadyMotion)
+assert_type(jj.linearize(scene, start, ("heading",)), Linearization)
+assert_type(jj.accelerations(scene, start.t, start.q, start.u), jj.Accelerations)
+partial = jj.equations.partial_velocities(scene, start.t, start.q, start.u)
+print(partial.linear.shape, jj.Visual.ball(0.1), jj.energy(scene, start.t, start.q, start.u).total)

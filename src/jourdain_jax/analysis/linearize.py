@@ -10,6 +10,9 @@ speeds (pdot, other independent speeds) and multiplied by M. Source: Wang and Pa
 (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +33,7 @@ from jourdain_jax.analysis.motion_derivatives import ByMatrices, instant_of, pla
 from jourdain_jax.analysis.state_space import Outputs, StateSpace, minimal, outputs_of
 from jourdain_jax.analysis.steady import in_phase
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Count, Indices, Numbers, Scalar, all_finite, holds, is_traced, static
+from jourdain_jax.calculus.reals import Count, Indices, Scalar, all_finite, holds, is_traced, static
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
@@ -38,7 +41,14 @@ from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, warn
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    InputLike,
+    as_input_vector,
+    as_scene,
+    shown_from_users_lines,
+    warn,
+)
 from jourdain_jax.scene.coordinates import Labels, as_names, check_name
 from jourdain_jax.scene.printing import Printed, complex_numbers, matrix
 from jourdain_jax.scene.scene import Scene
@@ -183,7 +193,7 @@ class Linearization(Printed, eqx.Module):
         C, D = rows[:, :count], rows[:, count:]
         return StateSpace(self.A, self.B, C, D, self.states, self.inputs, names, type(scene).__name__)
 
-    def to_control(self, outputs: Outputs = None):
+    def to_control(self, outputs: Outputs = None) -> Any:
         """Return `state_space(outputs)` as `control.ss` of python-control, with all names. Raises ImportError
         without python-control.
         """
@@ -194,9 +204,9 @@ class Linearization(Printed, eqx.Module):
         regulator. `states` of the result, and by default also `outputs`, are the names of the states kept.
 
         States on which no speed and no given output depends, directly or through others, are omitted, such as
-        x, y and yaw of a bicycle. States that other states determine, if only the inputs move the scene, are
-        also omitted, such as the forward speed of a bicycle, or one of two equal pendulums on a cart. Modes
-        that only initial values can excite are lost, even if they grow: compare `state_eigenvalues`.
+        x, y and yaw of a bicycle. Also omitted are states that other states determine as long as only inputs
+        excite the motion, such as the forward speed of a bicycle, or one of two equal pendulums on a cart.
+        Modes that only initial values can excite are lost, even if they grow: compare `state_eigenvalues`.
 
         Raises ValueError for an unknown name, and if no input moves the scene.
         """
@@ -215,10 +225,10 @@ class Linearization(Printed, eqx.Module):
 @shown_from_users_lines
 def linearize(
     scene: Scene | BuiltFor,
-    state: State | dict | None,
+    state: "State | Mapping[str, Any] | None",
     coordinates: str | Labels | None = None,
     *,
-    inputs: Numbers | dict | None = None,
+    inputs: InputLike = None,
     dependent: str | Labels | None = None,
     privileged: str | Labels | None = None,
 ) -> Linearization:
@@ -234,7 +244,7 @@ def linearize(
     - `state`: a state on the constraints. In a steady motion, only ignorable coordinates change, such as the
       yaw and the spin of a disc, and the matrices are constant. If the state is not steady, the matrices hold
       only at this instant, and `residual` measures the deviation. Contacts with friction keep the modes of
-      the state, which must be known: those that fly are absent, and friction acts against slip.
+      the state, which must be known: open contacts are absent, and friction acts against slip.
     - `coordinates`: names of the coordinates of the second-order form; default: all whose rate is
       independent. A quaternion `attitude` has `attitude_turn_x`, `..._y`, `..._z`: small rotations in body
       axes.

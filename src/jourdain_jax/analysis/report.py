@@ -84,7 +84,7 @@ class Report(Printed):
     domain: dict[str, tuple[float, float]]  # of the probed states, as declared by the scene
     conventions: str
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> "dict[str, Any]":
         """Return the fields by name, as plain data. None replaces infinite values."""
         facts = {
             key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()
@@ -148,8 +148,8 @@ class Report(Printed):
         freedoms = len(self.speeds) - (self.rank_at_start or 0)
         return (
             f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} "
-            "freedoms: a singular configuration, or another way to assemble the scene; declare a `domain` "
-            "around the start to find out"
+            "degrees of freedom: a singular configuration, or another way to assemble the scene; declare a "
+            "`domain` around the start to find out"
         )
 
     def _growth(self) -> str:

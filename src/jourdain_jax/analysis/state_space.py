@@ -2,8 +2,8 @@
 
     dx/dt = A x + B f,    y = C x + D f
 
-`minimal` omits states that have no effect, and states that other states determine if only the inputs move the
-scene. With x = X x', where x' are the states kept, the matrices become (A X)', B' and C X; the prime selects
+`minimal` omits states that have no effect, and states that others determine as long as only inputs excite the
+motion. With x = X x', where x' are the states kept, the matrices become (A X)', B' and C X; the prime selects
 the rows of the states kept.
 """
 
@@ -51,7 +51,7 @@ class StateSpace(Printed, eqx.Module):
         parts = [line for k in rows for line in matrix(k, getattr(self, k), rows[k], columns[k])]
         return "\n".join([f"State space of {self.title}", *parts])
 
-    def to_control(self):
+    def to_control(self) -> Any:
         """Return this model as `control.ss` of python-control, with names of states, inputs and outputs.
 
         Raises ImportError without python-control, and ValueError for a scene without inputs.
@@ -94,7 +94,7 @@ def _row(name: str, of: Callable, followed: Float[Array, "all independent"], slo
 @of_known_numbers
 def minimal(model: StateSpace, first_speed: int, named: bool) -> StateSpace:
     """Return the model without states on which neither speeds nor (if `named`) outputs depend, directly or
-    through others, and without states that other states determine if only the inputs move the scene.
+    through others, and without states that others determine as long as only inputs excite the motion.
 
     Entries below `rank_cutoff` times the largest entry count as zero. The unit of time is chosen so that
     rates of speeds and of coordinates are comparable. `first_speed`: index of the first speed among the

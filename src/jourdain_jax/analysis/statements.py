@@ -20,7 +20,16 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.verification import Check, check
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff, tiny_of
+from jourdain_jax.calculus.reals import (
+    Number,
+    Numbers,
+    Scalar,
+    as_real,
+    described,
+    largest,
+    rank_cutoff,
+    tiny_of,
+)
 from jourdain_jax.dynamics.accelerations import by_reduction, reductions
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import (
@@ -34,6 +43,7 @@ from jourdain_jax.equations.reductions import row_scale
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows, on_speeds, resultants
 from jourdain_jax.program.eager import eval_numpy
+from jourdain_jax.scene.arguments import InputLike
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Labels
 from jourdain_jax.scene.loads import Load
@@ -71,7 +81,9 @@ def central_difference(along: list, h: float):
     return (along[0] - 8 * along[1] + 8 * along[2] - along[3]) / (12 * h)
 
 
-def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
+def derivative_exists(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, direction: Scene, dq: Numbers, inputs: InputLike = None
+) -> bool:
     """Return whether accelerations have a derivative along a change of the parameters and coordinates.
 
     They have none if the change makes dependent constraints independent, that is, if

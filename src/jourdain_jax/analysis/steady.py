@@ -9,7 +9,7 @@ rely on the list of ignorable coordinates.
 """
 
 from collections.abc import Mapping
-from typing import Unpack
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -30,17 +30,7 @@ from jourdain_jax.analysis.motion_derivatives import (
     unseen,
 )
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import (
-    Flag,
-    Indices,
-    Number,
-    Numbers,
-    Scalar,
-    check_kind,
-    eps_of,
-    largest,
-    static,
-)
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Scalar, check_kind, eps_of, largest, static
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.contact_laws import SLOW, moves
 from jourdain_jax.equations.kinematics import motion_at
@@ -49,7 +39,14 @@ from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.program.eager import eval_numpy
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, as_time, shown_from_users_lines
+from jourdain_jax.scene.arguments import (
+    BuiltFor,
+    InputLike,
+    as_input_vector,
+    as_scene,
+    as_time,
+    shown_from_users_lines,
+)
 from jourdain_jax.scene.coordinates import Labels, as_names, check_names
 from jourdain_jax.scene.modes import SLIPS, Switching, switched
 from jourdain_jax.scene.printing import Printed
@@ -83,12 +80,12 @@ class SteadyMotion(Printed, eqx.Module):
 @shown_from_users_lines
 def steady(
     scene: Scene | BuiltFor,
-    guess: "State | dict",
+    guess: "State | Mapping[str, Any]",
     *,
     held: str | Labels = (),
     moving: str | Labels | None = None,
     t0: Number = 0.0,
-    inputs: Numbers | dict | None = None,
+    inputs: InputLike = None,
     privileged: str | Labels | None = None,
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
@@ -167,8 +164,8 @@ def in_phase(scene: Scene, t, q, u, f) -> tuple:
     if not modes or min(dict(modes).values()) < 0:
         raise ValueError(
             f"contacts with friction of `{type(scene).__name__}` ({', '.join(names)}) must fly, roll or slip "
-            "in a state whose numbers are known, outside `jit` and `vmap`; velocity constraints that may "
-            "slip are not supported"
+            "in a state whose numbers are known: call this outside `jit` and `vmap`; velocity constraints "
+            "that may slip are not supported"
         )
     phase = switched(scene, Switching(phase=modes))
     return phase, q[: len(phase.coordinate_names)], f[1 : 1 + len(phase.inputs)]

@@ -1,5 +1,7 @@
 """Results of `verify`: checks, each with its value, threshold and culprit, and a table of them."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 
@@ -36,15 +38,15 @@ class Check(eqx.Module):
         """Return whether the value is within its threshold."""
         return bool(self.value <= self.threshold)
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> "dict[str, Any]":
         """Return the check as plain data; a value that is not finite is None."""
         value = float(self.value) if np.isfinite(self.value) else None
         return vars(self) | {"value": value, "passed": self.passed}
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:
-    """Return the check `name` (a key of `THRESHOLDS`) from one value per suspect. The suspect with the
-    largest value is the culprit; NaN counts as larger than any number.
+    """Return the check `name` (a key of `THRESHOLDS`) from one value per subject. `culprit` is the subject
+    with the largest value; NaN counts as larger than any number.
     """
     threshold = THRESHOLDS[name][np.dtype(dtype).name == "float32"]
     if not values:
@@ -81,7 +83,7 @@ class Verification(Printed, eqx.Module):
         values = [check.value for check in self.checks if check.name in names]
         return float(np.max(values)) if values else 0.0
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> "dict[str, Any]":
         """Return the result as plain data: the largest value of each kind, and all checks."""
         return {
             "max_disagreement": self.largest("reductions", "forms", "Newton"),

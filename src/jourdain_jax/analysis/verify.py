@@ -34,7 +34,7 @@ import numpy as np
 from jourdain_jax.analysis.statements import gradient_checks, statement_checks
 from jourdain_jax.analysis.verification import Verification, check
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, Scalar, Speeds, checked_whole, largest, tiny_of
+from jourdain_jax.calculus.reals import Number, Numbers, Scalar, Speeds, checked_whole, largest, tiny_of
 from jourdain_jax.dynamics.accelerations import bare_accelerations, by_reduction, diagnosed, reductions
 from jourdain_jax.dynamics.reactions import newton_residual, power, row_reactions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
@@ -45,6 +45,7 @@ from jourdain_jax.equations.kinematics import (
     of_bodies,
     partial_velocities,
     shapes_along_motion,
+    speeds_are_rates,
     velocities,
 )
 from jourdain_jax.equations.reductions import row_scale, speed_scale
@@ -54,7 +55,6 @@ from jourdain_jax.equations.virtual_power import (
     equations_and_rows,
     lagrange_equations,
     on_speeds,
-    speeds_are_rates,
     unconstrained_equations,
 )
 from jourdain_jax.integrate.state_projection import State
@@ -64,6 +64,7 @@ from jourdain_jax.motion.start import consistent
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.arguments import (
     BuiltFor,
+    InputLike,
     as_input_vector,
     as_scene,
     of_known_numbers,
@@ -199,7 +200,7 @@ def _size(found: dict, *others) -> float:
 
 
 def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, dict[str, float]]:
-    """Return relative differences by check and suspect."""
+    """Return relative differences by check and subject."""
     size, names = _size(found, found["reference"]), names_of_rows(scene)
     virtual = {f"reduction `{name}`": found["force"][name] for name in applicable}
     virtual |= {f"constraint `{name}`": force for name, force in zip(names, found["rows"], strict=True)}
@@ -288,7 +289,7 @@ class EnergyBalance:
         )
 
 
-def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
+def energy(scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None) -> Energy:
     """Return the kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs
     (default: zero).
     """

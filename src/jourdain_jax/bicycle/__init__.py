@@ -1,4 +1,8 @@
-"""Measured bicycles: parameter files and raw measurements, linear stability and its uncertainty, rides."""
+"""Measured bicycles: parameter files and raw measurements, linear stability and its uncertainty, rides.
+
+The formats of the files in `data` stay readable; add a bicycle by adding a file. Open `job.py` first, then
+`stability.py`. The nonlinear model is `models/whipple_bicycle.py`.
+"""
 
 from jourdain_jax.bicycle.job import Refused, Study, run, study, table, write_results
 from jourdain_jax.bicycle.measurements import benchmark_from_measurements, read_readings

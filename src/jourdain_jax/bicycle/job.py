@@ -7,9 +7,10 @@ simulated below, inside and above the stable range.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,12 +44,12 @@ CAVEAT = (
 
 @dataclass(frozen=True)
 class Refused:
-    """The result for a file that describes no possible bicycle, with the reason."""
+    """The result for a file that describes an impossible bicycle, with the reason."""
 
     path: str
     error: str
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> "dict[str, Any]":
         """Return one object of `result.json`."""
         return {"file": self.path, "bicycle": None, "error": self.error} | dict.fromkeys(SPEEDS)
 
@@ -68,7 +69,7 @@ class Study:
     rides: dict[str, float]  # label -> speed (m/s) of each simulated ride
     lanes: Rollout  # the rides
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> "dict[str, Any]":
         """Return one object of `result.json`."""
         lanes = [self.lanes.lane(i) for i in range(len(self.rides))]
         rides = [
@@ -183,7 +184,11 @@ def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndar
 
 
 def run(
-    paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None
+    paths: Sequence[str | Path],
+    *,
+    samples: int = 2000,
+    seed: int = 0,
+    progress: Callable[[str], Any] = lambda text: None,
 ) -> list[Study | Refused]:
     """Return the studies of all files, in order, with shared compiled programs."""
     studies = []

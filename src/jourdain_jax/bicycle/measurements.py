@@ -93,7 +93,7 @@ class Readings:
 
 
 def holds_readings(path: Path) -> bool:
-    """Return whether the name of a file is that of a file of raw measurements."""
+    """Return whether a file name denotes raw measurements."""
     return path.name.endswith("Measured.txt")
 
 

@@ -85,7 +85,9 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
 
 
 def shipped_bicycles() -> dict[str, Path]:
-    """Return the parameter files shipped with the package, name -> path. `Tms` is no possible bicycle."""
+    """Return the parameter files shipped with the package, name -> path. `Tms` describes an impossible
+    bicycle.
+    """
     return _shipped("Benchmark")
 
 

@@ -8,6 +8,7 @@ have Izz = Ixx.
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -17,7 +18,7 @@ from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.coordinates import Labels, Sentences
 
 # name -> unit, meaning and sign, in the order of the paper's table and of arrays of parameters
-PARAMETERS: dict[str, Mapping] = {
+PARAMETERS: "dict[str, Mapping[str, Any]]" = {
     field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")
 }
 PARAMETER_NAMES: Labels = tuple(PARAMETERS)

@@ -44,7 +44,7 @@ from jourdain_jax.analysis.linearize import companion, linearize, sorted_eigenva
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, violations
 from jourdain_jax.calculus.compilation import compiled_quickly
-from jourdain_jax.calculus.reals import Flag, Scalar, real_type
+from jourdain_jax.calculus.reals import Flag, Number, Scalar, real_type
 from jourdain_jax.integrate.state_projection import State, state_of
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
@@ -78,7 +78,7 @@ class StabilitySpeeds(eqx.Module):
     stable_range_exists: Flag
 
 
-def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
+def upright_running(bicycle: WhippleBicycle, speed: Number, lean_rate: Number = 0.0) -> State:
     """Return the state of upright straight running at `speed` (m/s), a steady motion if `lean_rate` (rad/s)
     is zero. The state satisfies the constraints exactly.
     """
@@ -248,7 +248,7 @@ def sample_parameters(
     bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int
 ) -> ParameterSamples:
     """Return `count` bicycles drawn from a normal distribution with the measured values and their covariance.
-    If this is unknown, parameters are independent, with their sigmas.
+    If the covariance is unknown, parameters are independent, with their sigmas.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())

@@ -1,8 +1,8 @@
 """Compilation with little overhead per call, and JAX's default modes.
 
 Compiled functions have a tenth of the overhead of `equinox.filter_jit`, and cheaper XLA options where
-compiling takes longer than running. Inside the package, types and ranks promote by JAX's defaults even if the
-user has set stricter modes.
+compiling takes longer than running. Inside the package, JAX's default promotion of types and ranks applies
+even if the user has set stricter modes.
 """
 
 from collections.abc import Callable

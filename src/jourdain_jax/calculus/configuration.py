@@ -4,9 +4,9 @@ Why XLA's pool has at least 16 threads: a batched LAPACK call of jaxlib 0.10 wai
 for work that is queued on the same pool. If all threads make such calls, they wait for ever (observed with
 two threads and 24 independent batches of 30,000 solves). jaxlib 0.11 no longer splits batches.
 
-Why loops are compiled into one function: by default, XLA does so only if its body touches less than
-1 kB. Otherwise it starts each operation separately. Then a motion of one disc by XLA takes 8.3 ms, otherwise
-0.6 ms. Machine code does not depend on it.
+Why loops are compiled into one function: by default, XLA does so only if its body touches less than 1 kB.
+Otherwise it starts each operation separately, and a motion of one disc by XLA takes 8.3 ms instead of 0.6 ms.
+Machine code is not affected.
 """
 
 import os
@@ -37,12 +37,12 @@ def configure(*, threads: int | None = None, xla_threads: int | None = None) -> 
     `XLA_FLAGS` gets an option that compiles loops which touch less than 1 MB into one function, unless it
     contains `xla_backend_extra_options`: motions by XLA are then four to ten times as fast.
 
-    **Raises** RuntimeError if JAX has computed already.
+    **Raises** RuntimeError if JAX has already computed something.
     """
     if _has_started():
         raise RuntimeError(
-            "JAX has computed already, and it reads these settings only once; call `jj.configure()` before "
-            "the first computation of JAX and before the first scene is made"
+            "JAX has already computed something, and reads these settings only once; call `jj.configure()` "
+            "before the first computation of JAX and before the first scene is made"
         )
     stated = {"JOURDAIN_JAX_THREADS": (threads, "`threads`"), "PJRT_NPROC": (xla_threads, "`xla_threads`")}
     for variable, (count, what) in stated.items():
@@ -52,7 +52,7 @@ def configure(*, threads: int | None = None, xla_threads: int | None = None) -> 
 
 
 def configure_by_default() -> None:
-    """Apply the defaults of `configure`, unless they are set or JAX has computed already."""
+    """Apply the defaults of `configure`, unless they are set or JAX has already computed something."""
     flags = os.environ.get("XLA_FLAGS", "")
     complete = "xla_backend_extra_options" in flags and not os.environ.keys().isdisjoint(_POOL)
     if not (complete or _has_started()):
@@ -70,7 +70,7 @@ def _with_defaults() -> dict[str, str]:
 
 
 def _has_started() -> bool:
-    """Return whether JAX has computed anything: from then on it refuses another number of devices."""
+    """Return whether JAX has computed anything, after which its settings are fixed."""
     devices = jax.config.jax_num_cpu_devices
     try:
         jax.config.update("jax_num_cpu_devices", devices + 1)

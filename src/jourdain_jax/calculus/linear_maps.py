@@ -238,8 +238,8 @@ class BothWays(NamedTuple):
         )
 
     def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
-        """Return the derivative of Jacobian-vector products with respect to other leaves, and to the tangents
-        if indices beyond the results are among the `others`. The derivative also depends on the tangents.
+        """Return the derivative of Jacobian-vector products with respect to the leaves `others`, where
+        indices beyond the results denote tangents. The derivative also depends on the tangents.
         """
         count = len(self.leaves) + len(self.found)
         leaves = [i for i in others if i < count]

@@ -9,8 +9,8 @@ For a computation y(x) between `entered` and `left`, with some samples that fail
     forward     dy = NaN where y failed and any dx is not zero
     reverse     dx = 0 where every dy is zero, NaN where the dy of a failed y is not      (dx, dy: cotangents)
 
-`jnp.where(failed, nan, x)` alone gives wrong derivatives: zero where it is NaN, as at a minimum, and 0 NaN
-from failed values that are not used.
+`jnp.where(failed, nan, x)` alone gives wrong derivatives: zero where the value is NaN, as if it were a
+minimum, and NaN from failed values that are not used (0 times NaN).
 
 An extra number, which is zero, goes from `entered` to `left`; its derivative counts the nonzero derivatives.
 The rules are linear maps, and so are their derivatives. In reverse mode of such a derivative, cotangents

@@ -8,7 +8,7 @@ Column k of `R` is body axis k in the inertial frame. With x ahead, y to the lef
 act as follows: `rot_z` turns to the left, `rot_x` leans to the right, `rot_y` pitches the nose down and rolls
 a wheel ahead.
 
-Vectors of three numbers.
+`vec` makes vectors of three numbers.
 """
 
 from collections.abc import Callable, Sequence

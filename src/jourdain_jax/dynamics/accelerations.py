@@ -2,7 +2,8 @@
 
 kinematics -> virtual power (M, h, Q) -> constraints (A, drift) -> reduction -> udot, lambda
 
-Normal forces of contacts built into the coordinates, from Newton's equations of the supported bodies.
+Normal forces of contacts that are built into the coordinates follow from Newton's equations of the supported
+bodies:
 
     sum_i N_i n_i              = sum_j f_j                            f_j = m_j a_j - F_j - R_j
     sum_i N_i (p_i - o) x n_i  = sum_j (r_j - o) x f_j + T_j
@@ -16,6 +17,8 @@ balance of moments. If the N_i are still not unique, they have minimum norm. On 
 always sum to the total load of the bodies.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,6 +31,8 @@ from jourdain_jax.calculus.reals import (
     Count,
     Flag,
     Indices,
+    Number,
+    Numbers,
     PerRow,
     Scalar,
     Speeds,
@@ -57,6 +62,7 @@ from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equatio
 from jourdain_jax.program.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import (
     ChangingInputs,
+    InputLike,
     as_coordinates,
     as_input_vector,
     as_scene,
@@ -152,12 +158,12 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
 
 def accelerations(
     scene: Scene,
-    t,
-    q,
-    u,
-    inputs=None,
+    t: Number,
+    q: Numbers,
+    u: Numbers,
+    inputs: InputLike = None,
     *,
-    reduction=None,
+    reduction: Any = None,
     stabilisation: Baumgarte | None = None,
     usual: UsualRows | None = None,
 ) -> Accelerations:

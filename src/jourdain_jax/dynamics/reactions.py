@@ -41,7 +41,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import Flag, Indices, Scalar, largest, rank_cutoff, static
+from jourdain_jax.calculus.reals import Flag, Indices, Number, Numbers, Scalar, largest, rank_cutoff, static
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.dynamics.accelerations import Accelerations, Wrenches, normal_forces
 from jourdain_jax.equations.kinematics import (
@@ -65,7 +65,7 @@ from jourdain_jax.equations.virtual_power import (
     switching_forces,
 )
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import InputLike, as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Labels, Named, UnknownNameError, check_name
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
@@ -76,7 +76,9 @@ from jourdain_jax.structure.structure import Structure, structure_of
 
 
 @eager_if_concrete
-def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
+def newton_residual(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, udot: Numbers, inputs: InputLike = None
+) -> Velocities:
     """Return the constraint force `m a - F` (N) and torque `I alpha + omega x I omega - L` (N m, about the
     mass centre) on each body; (1)-(3).
 

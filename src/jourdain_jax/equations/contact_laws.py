@@ -159,8 +159,9 @@ def coulomb(law: Law) -> Solution:
 
 
 def _in_other_modes(law: Law, found: Solution) -> Solution:
-    """Return the solution after a trial of all combinations of open and closed contacts. If `found` does not
-    satisfy the law, a combination that does replaces it; if both do, there are several solutions.
+    """Return the solution after a trial of all combinations of open and closed contacts. If `found` violates
+    the law, a combination that satisfies it is returned instead; if both satisfy it, there are several
+    solutions.
     """
     (closed, rolls, e), several = found.modes, found.several
     if_closed = jnp.where(law.slides, 0.0, jnp.where(closed > 0, rolls, 1.0))

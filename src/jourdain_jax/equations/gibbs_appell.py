@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import PerRow, Scalar, Speeds
+from jourdain_jax.calculus.reals import Number, Numbers, PerRow, Scalar, Speeds
 from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
 from jourdain_jax.equations.kinematics import Inertias, bias_accelerations, inertias, inertias_of, velocities
 from jourdain_jax.equations.reductions import (
@@ -45,12 +45,12 @@ from jourdain_jax.equations.virtual_power import (
     mass_matrix,
 )
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import InputLike, as_coordinates, as_speeds
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
 
-def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
+def gibbs_function(scene: Scene, t: Number, q: Numbers, u: Numbers, udot: Numbers) -> Scalar:
     """Return the Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4,
     up to terms without accelerations; (12)-(14).
 
@@ -70,7 +70,9 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
 
 
 @eager_if_concrete
-def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+def gibbs_equations(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None
+) -> UnconstrainedEquations:
     """Return M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at
     `udot = 0`; (12)-(17).
 

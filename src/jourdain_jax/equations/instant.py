@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, as_real
+from jourdain_jax.calculus.reals import Number, Numbers, Scalar, as_real
 from jourdain_jax.equations.kinematics import (
     Inertias,
     Velocities,
@@ -24,7 +24,7 @@ from jourdain_jax.equations.kinematics import (
 )
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
+from jourdain_jax.scene.arguments import InputLike, as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -60,7 +60,9 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
 
 
 @eager_if_concrete
-def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
+def constraint_rows(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None
+) -> ConstraintRows:
     """Return phi, `A = d phi/du`, the drift and the names of all constraint rows: `A udot = -drift`, where
     the drift is `d phi/dt` at `udot = 0`; eqs. (5)-(9), (25).
 

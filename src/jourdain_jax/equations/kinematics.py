@@ -16,10 +16,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Numbers, PerCoordinate, Scalar, Vector3, as_real, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, PerCoordinate, Scalar, Vector3, as_real, real_type
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
+from jourdain_jax.scene.arguments import (
+    ChangingInputs,
+    InputLike,
+    as_coordinates,
+    as_input_vector,
+    as_scene,
+    as_speeds,
+    as_time,
+)
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -42,7 +50,7 @@ class Inertias(eqx.Module):
     inertia: Float[Array, "bodies 3 3"]  # kg m^2
 
 
-def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> PerCoordinate:
+def coordinate_rates(scene: Scene, t: Number, q: Numbers, u: Numbers) -> PerCoordinate:
     """Return `qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))
@@ -57,7 +65,7 @@ def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coo
     return jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(jnp.zeros(len(scene.speed_names))).T
 
 
-def pose_at(scene: Scene, t, q: Numbers) -> Pose:
+def pose_at(scene: Scene, t: Number, q: Numbers) -> Pose:
     """Return poses of all bodies (m, inertial frame), sorted by name as in JAX's dictionaries."""
     t, q = as_time(t), as_coordinates(scene, q)
     named = scene.coordinate_names.view(q)
@@ -65,7 +73,7 @@ def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     return Pose(t, named, {name: BodyPose(name, body) for name, body in bodies})
 
 
-def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
+def motion_at(scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None) -> Motion:
     """Return poses and velocities (inertial frame) of all bodies at one instant.
 
     `inputs`: values of the scene's inputs (default: zero), or `ChangingInputs`.
@@ -128,7 +136,7 @@ def velocities_of(motion: Motion) -> Velocities:
 
 
 @eager_if_concrete
-def partial_velocities(scene: Scene, t, q, u) -> Velocities:
+def partial_velocities(scene: Scene, t: Number, q: Numbers, u: Numbers) -> Velocities:
     """Return `beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds),
     bodies sorted by name; eqs. (26)-(31), (49).
     """
@@ -157,3 +165,13 @@ def inertias_of(pose: Pose | Motion) -> Inertias:
     zero = jnp.zeros((3, 3), pose.q.array.dtype)
     inertia = jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies])
     return Inertias(jnp.stack([b.mass for b in bodies]), (inertia + inertia.mT) / 2)
+
+
+def speeds_are_rates(scene: Scene) -> bool:
+    """Return whether the speeds are the coordinates' own rates (no quaternions, no quasi-velocities)."""
+    scene = as_scene(scene)
+    return (
+        not scene.coordinates.quaternions
+        and scene.speeds is None
+        and type(scene).coordinate_rates is Scene.coordinate_rates
+    )

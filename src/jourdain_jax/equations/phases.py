@@ -27,10 +27,11 @@ may integrate over the normal impulse instead. Source: J. J. Moreau, in: Nonsmoo
 (1988).
 
 Bounces whose speeds shrink by the ratio r end after the time 2 w/(a (1 - r)): w speed of rebound, a downward
-acceleration. If one flight ends at most `SETTLES` deep in the ground, it replaces them and the contact closes
-with restitution 0. Meanwhile the slots of the slip direction hold the time at which the flight ends, and 1;
-after an earlier rebound, its speed w and 0. If the body strikes with another speed, because another contact
-struck in between, the series is not steady, and its bounces go on down to `LEAST_SLIP`.
+acceleration. If a single flight of that duration ends at most `SETTLES` below the ground, it replaces them,
+and the contact then closes with restitution 0. During this flight, the two slots of the slip direction hold
+the time at which it ends, and 1; during earlier flights, the speed w of the last rebound, and 0. If the body
+strikes with another speed, because another contact struck in between, the series is not steady, and its
+bounces go on down to `LEAST_SLIP`.
 
 `At` holds the switching contacts at one state: their modes and their response to forces.
 """
@@ -184,8 +185,8 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
 
     If contacts strike, impulses of impact act; otherwise, where a slip `stops`, impulses remove the remaining
     slip. Then Coulomb's law for accelerations decides which contacts without slip open, stick or begin to
-    slip; contacts that it `begins` with slip. If it has no solution, or an impact would gain energy, the mode
-    of contact i becomes a negative number that tells the reason.
+    slip. Contacts at which slip `begins` slip. If the law has no solution, or an impact would gain energy,
+    the mode of contact i becomes a negative number, a code for the reason.
     """
     motion, rows = at.motion, at.found.rows
     hits, goes_on = jnp.any(strikes), jnp.any(begins)

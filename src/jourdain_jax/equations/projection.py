@@ -237,7 +237,7 @@ def project_speeds(
     - `determined`: whether affine constraints determine all `free` speeds. No metric is then used, and
       `typical` is in plain speeds.
     - `by`: the evaluation of constraints and mass matrix.
-    - `plain`: if lanes may share the numbers of the scene, the same scene without derivatives.
+    - `plain`: if samples may share the numbers of the scene, the same scene without derivatives.
     """
     if not names_of_rows(scene):
         return u

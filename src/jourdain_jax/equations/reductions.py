@@ -8,9 +8,9 @@
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
 - `GibbsAppell`: Hessian of the Gibbs function over the independent accelerations (in `gibbs_appell.py`)
 
-All agree to round-off where they apply, which `applicable` tells. If a free direction has no inertia,
-accelerations are NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All allow
-dependent constraints: the rank is determined at every state, and the multipliers have minimum norm.
+All agree to round-off where they apply (`applicable`). If a free direction has no inertia, accelerations are
+NaN, except by `Multipliers`, whose test is too coarse near a loss of rank. All allow dependent constraints:
+the rank is determined at every state, and the multipliers have minimum norm.
 
 Scaling before rank decisions: speeds by their inertia, constraint rows by their length.
 

@@ -15,7 +15,7 @@ The names of the parts of a scene are found by tracing it once, without evaluati
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import PerContact, PerRow, Scalar
+from jourdain_jax.calculus.reals import Number, Numbers, PerContact, PerRow, Scalar
 from jourdain_jax.equations.contact_laws import unit
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
@@ -142,7 +142,7 @@ def flatten_rows(rows: dict[str, Array], dtype) -> PerRow:
     return jnp.concatenate([value.reshape(-1) for value in rows.values()]) if rows else jnp.zeros(0, dtype)
 
 
-def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
+def position_residual(scene: Scene, t: Number, q: Numbers) -> Float[Array, "geometric_rows"]:
     """Return `g(t, q)` of all geometric constraints, shape (geometric rows,), in their own units; zero on the
     constraints. Eq. (5).
     """
@@ -154,7 +154,7 @@ def _position_residual(scene: Scene, t: Scalar, q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 
 
-def velocity_residual(scene: Scene, t, q, u, inputs=None) -> PerRow:
+def velocity_residual(scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: Any = None) -> PerRow:
     """Return `phi(t, q, u)` of all constraints, shape (rows,), in their own units per s; zero on the
     constraints. Eqs. (6)-(9).
 
@@ -221,9 +221,9 @@ def contact_rows(scene: Scene, motion: Motion) -> ContactRows:
 
 
 def in_whole_scene(scene: Scene, motion: Motion) -> tuple[Scene, Motion, PerRow | float]:
-    """Return the scene whose contacts may switch, for a scene in a phase, with its motion, and the shares of
-    contact forces that are loads: 1 for friction along slip, 0 for multipliers. If no contact slips in a
-    phase, return the arguments and 1.
+    """Return the scene whose contacts may switch, its motion, and a factor for each contact force, from a
+    scene in a phase: 1 for friction along slip, which is a load, and 0 for multipliers. If no contact slips,
+    return the arguments and 1.
     """
     if SLIPS not in dict(phase := scene.switching.phase).values():
         return scene, motion, 1.0

@@ -1,5 +1,4 @@
-"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible
-virtual velocity.
+"""Jourdain's principle for rigid bodies: virtual power vanishes for every admissible virtual velocity.
 
     sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k
         =  M udot + h - Q                                                                         (50), (56)
@@ -38,6 +37,7 @@ from jourdain_jax.equations.kinematics import (
     of_bodies,
     partial_velocities,
     pose_at,
+    speeds_are_rates,
     velocities_of,
 )
 from jourdain_jax.equations.rows import (
@@ -49,7 +49,7 @@ from jourdain_jax.equations.rows import (
     in_whole_scene,
 )
 from jourdain_jax.program.eager import eager_if_concrete
-from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
+from jourdain_jax.scene.arguments import InputLike, Number, Numbers, as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.coordinates import check_name
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.modes import FLIES, ROLLS, SLIPS
@@ -122,7 +122,7 @@ def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | Non
     return V if extra is None else V + extra
 
 
-def kinetic_energy(scene: Scene, t, q, u) -> Scalar:
+def kinetic_energy(scene: Scene, t: Number, q: Numbers, u: Numbers) -> Scalar:
     """Return `T = sum m v.v/2 + omega.I omega/2` in J."""
     return _kinetic_energy(motion_at(scene, t, as_coordinates(scene, q), as_speeds(scene, u)))
 
@@ -139,11 +139,12 @@ def _kinetic_energy(motion: Motion) -> Scalar:
 
 
 @eager_if_concrete
-def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+def unconstrained_equations(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None
+) -> UnconstrainedEquations:
     """Return M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
 
-    M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: values of the scene's inputs
-    (default: zero).
+    M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: zero by default.
     """
     return equations_of(scene, instant_at(scene, t, q, u, inputs))
 
@@ -202,7 +203,7 @@ def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Ve
 
 
 @eager_if_concrete
-def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Speeds:
+def generalized_forces(scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None) -> Speeds:
     """Return `Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
 
     `inputs`: values of the scene's inputs (default: zero).
@@ -350,7 +351,15 @@ def _potential_gradient(scene: Scene, motion: Motion) -> Speeds:
     return dV @ N
 
 
-def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Scalar:
+def virtual_power(
+    scene: Scene,
+    t: Number,
+    q: Numbers,
+    u: Numbers,
+    udot: Numbers,
+    virtual_velocity: Numbers,
+    inputs: InputLike = None,
+) -> Scalar:
     """Return the residual of Jourdain's variational equation (18), in W:
 
         sum (m a - F) . delta_1 v = delta u . (M udot + h - Q)
@@ -366,14 +375,15 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
 
 
 @eager_if_concrete
-def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+def lagrange_equations(
+    scene: Scene, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None
+) -> UnconstrainedEquations:
     """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy:
     `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
 
-    `inputs`: values of the scene's inputs (default: zero). Raises ValueError if the speeds are not the
-    coordinate rates.
+    `inputs`: zero by default. Raises ValueError if the speeds are not the coordinate rates.
     """
-    if not speeds_are_rates(as_scene(scene)):
+    if not speeds_are_rates(scene):
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are "
             "quasi-velocities; use Appell's equations"
@@ -388,12 +398,3 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
     # h = d/dt (dT/dqdot) at qddot = 0, minus dT/dq
     h = momentum_rate - jax.grad(kinetic_energy, argnums=2)(scene, t, q, u)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
-
-
-def speeds_are_rates(scene: Scene) -> bool:
-    """Return whether the speeds are the coordinates' own rates (no quaternions, no quasi-velocities)."""
-    return (
-        not scene.coordinates.quaternions
-        and scene.speeds is None
-        and type(scene).coordinate_rates is Scene.coordinate_rates
-    )

@@ -113,7 +113,7 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
             break
         changed = problem.restrict(found.theta[going], going)
         again = problem.minimum(
-            found.theta[going], going, "whole runs, after a turn of correlation times", some
+            found.theta[going], going, "whole runs, after an update of correlation times", some
         )
         found = found.continued(going, again)
         going = going[(changed > 1e-3) | ~again.converged]

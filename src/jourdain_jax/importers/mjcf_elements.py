@@ -134,8 +134,8 @@ class Defaults:
         for section in file.root.findall("default"):
             if section.get("class", "main") != "main":
                 raise file.fault(
-                    f"the outermost `default` is of the class `{section.get('class')}`, expected `main`: put "
-                    "a `default` of that class into it"
+                    f"the outermost `default` has the class `{section.get('class')}`, expected `main`: put "
+                    "a `default` with that class into it"
                 )
             self._read(section, "main", {})
 
@@ -143,7 +143,7 @@ class Defaults:
         known, motor = {kind: dict(attributes) for kind, attributes in inherited.items()}, TABLE["motor"]
         kinds = [element.tag for element in section if element.tag != "default"]
         if twice := next((kind for kind in kinds if kinds.count(kind) > 1), None):
-            raise self._file.fault(f"the class `{name}` states `{twice}` twice, expected once")
+            raise self._file.fault(f"the class `{name}` defines `{twice}` twice, expected once")
         for element in section:
             if element.tag != "default":
                 self._file.check_text(element, f"`{element.tag}` of the class `{name}`")
@@ -161,7 +161,7 @@ class Defaults:
             if not inner:
                 raise self._file.fault(f"a `default` inside the class `{name}` has no `class`; give it one")
             if inner in self._classes:
-                raise self._file.fault(f"two `default` are of the class `{inner}`; give each its own class")
+                raise self._file.fault(f"two `default` elements have the class `{inner}`; give each its own")
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> Part:
@@ -170,7 +170,7 @@ class Defaults:
         """
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
-            raise self._file.fault(f"{what} is of the class `{name}`, which no `default` states")
+            raise self._file.fault(f"{what} has the class `{name}`, which no `default` defines")
         found = self._classes[name].get(element.tag, {}) | dict(element.attrib)
         self._file.check_attributes(element.tag, found, what)
         return Part(self._file, what, element, found)

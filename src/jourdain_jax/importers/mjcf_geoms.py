@@ -41,7 +41,7 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 
 
 def combined(masses: list[Mass]) -> Mass:
-    """Return the combined mass properties of several masses in one frame, by the parallel-axis theorem,
+    """Return the combined mass properties of several masses in one frame, by the parallel-axis theorem:
 
     `I = sum I_i + m_i (d_i.d_i - d_i d_i')`.
     """

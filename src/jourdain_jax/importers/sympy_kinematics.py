@@ -10,8 +10,7 @@ one for each inertial axis along which they differ at states that satisfy the co
 same difference share them. A frame that has an angular velocity about an axis of another frame, but no
 orientation, gets an angle.
 
-Values of SymPy expressions at random states, used to detect constants, rates of coordinates, and repeated
-constraints.
+Values of SymPy expressions at random states reveal constants, rates of coordinates, and repeated constraints.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -56,8 +55,8 @@ def sampled(
     """Return the first random states at which all expressions are finite. Random speeds are projected onto
     the constraints `rows`, which are affine in the speeds.
 
-    Constants with given numbers have these. Raises ValueError, with the name of a list, if there are too few
-    such states.
+    Constants keep the numbers given for them. Raises ValueError, with the name of a list, if there are too
+    few such states.
     """
     named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()}
     named[""] = [system.rates[q.diff(system.time)] for q in system.coordinates]

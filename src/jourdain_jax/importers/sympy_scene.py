@@ -99,7 +99,7 @@ class SympyScene(Scene):
 
 
 def from_sympy(
-    system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene"
+    system: Any, origin: Any = None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene"
 ) -> type[Scene]:
     """Return a class of scenes from SymPy's mechanics. Poses, loads and constraints are imported; the
     equations of motion are derived by the engine.

@@ -29,9 +29,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import PerRow, Scalar, Speeds, static
 from jourdain_jax.calculus.roots import newton_root
-from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at, speeds_are_rates
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
-from jourdain_jax.equations.virtual_power import energies_at, on_speeds, resultants, speeds_are_rates
+from jourdain_jax.equations.virtual_power import energies_at, on_speeds, resultants
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.integrate.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.integrate.vector_fields.field import Instant, Integrated, VectorField

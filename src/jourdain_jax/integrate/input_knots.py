@@ -99,7 +99,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """Return `inputs` with samples as within the step around `middle` (s; infinite: no step)."""
+    """Return `inputs`, with samples seen from within the step around `middle` (s; infinite: no step)."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

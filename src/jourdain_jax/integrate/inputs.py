@@ -11,6 +11,7 @@ needs no compilation; a function whose globals have changed is a new program.
 
 from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -185,7 +186,7 @@ class Sampled(eqx.Module):
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
     values: Float[Array, "samples"] = eqx.field(converter=as_real)
 
-    def __init__(self, ts, values):
+    def __init__(self, ts: Any, values: Any):
         self.ts, self.values = in_default_precision(checked_samples("Sampled", ts, values, 1, "input"))
 
     def __call__(self, t):

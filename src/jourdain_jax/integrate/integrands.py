@@ -2,7 +2,7 @@
 batch.
 
 `args`: the vector field, the scene, its inputs, the part of the rates that depends on parameters only, and
-the origin of tau. Of a batch, they have the batch axis first.
+the origin of tau. In a batch, their batch axis comes first.
 """
 
 from collections.abc import Callable

@@ -251,8 +251,8 @@ def _reason_against_sides(setup: Setup) -> str:
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool, watched: bool) -> bool:
     """Return whether rates may jump at a time that varies and whose derivatives are neglected. Such a time
-    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`: relations are
-    monitored.
+    depends on the state, on numbers of inputs or, if `scene_varies`, on parameters. `watched`: whether
+    relations are monitored.
     """
     if watched and field.lowered is not None:
         program, numbers = _relations(field.lowered, inputs, False)
@@ -287,8 +287,8 @@ def width(program: Lowered) -> int:
 
     A block runs until its slowest sample ends, and its data should fit a core's fastest cache. Small blocks
     are therefore best if their overhead is small. On a CPU it is small if XLA compiles the whole loop into
-    one function, as it does for loops that use little memory (see `jourdain_jax`). Otherwise XLA starts each
-    operation separately, and many samples must share that cost.
+    one function, as it does for loops that use little memory (`calculus/configuration.py`). Otherwise XLA
+    starts each operation separately, and many samples must share that cost.
     """
     # larger loops use too much memory to become one function; the bicycle, with 2016 operations, still
     # becomes one

@@ -121,7 +121,7 @@ MESSAGES = {
     ZENO: (
         "events follow each other within round-off, like the last bounces of a ball: let an event switch to "
         "a mode of rest, or use a contact with `friction=`, which comes to rest if its bounces shrink by a "
-        "steady ratio; otherwise reduce `restitution=`"
+        "constant ratio; otherwise reduce `restitution=`"
     ),
     AMBIGUOUS: (
         "contacts with friction may move in several ways: open as well as stay closed, by Coulomb's law; "

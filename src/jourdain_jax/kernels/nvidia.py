@@ -153,8 +153,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """Return the number of warps for these `lanes`: at most as many as the registers allow, and as have their
-    local memory in the first-level cache. The limit by the cache is at least four per multiprocessor.
+    """Return the number of warps for these `lanes`, limited by the registers and by the local memory that
+    fits in the first-level cache. The cache allows at least four per multiprocessor.
     """
     # numbers of a device's attributes: multiprocessors (16), and for each of these registers (82), cache
     # usable as shared memory (81), maximum number of blocks (106)

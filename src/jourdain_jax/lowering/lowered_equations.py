@@ -5,6 +5,7 @@ import importlib.util
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +125,7 @@ class Lowered:
         """
         return export.c_source(self, name)
 
-    def expressions(self) -> dict:
+    def expressions(self) -> "dict[str, Any]":
         """Return SymPy expressions of all rates, by name. Requires SymPy. For large scenes, expressions fill
         many pages.
         """

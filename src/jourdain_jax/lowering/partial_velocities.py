@@ -79,9 +79,10 @@ class Kinematics:
         self._shape(known(simple), partial, along)
 
     def through_velocities(self) -> tuple:
-        """Return replacements of traced velocities and orientations by short nodes, functions that
-        differentiate rows with respect to the speeds and along the motion, and the simplified velocities, by
-        speeds and along the motion. The rates are at constant speeds, by default with replaced velocities.
+        """Return six parts: replacements of traced velocities and orientations by short nodes; two functions
+        that differentiate rows, with respect to the speeds and along the motion (at constant speeds); the
+        simplified velocities, their derivatives with respect to the speeds, and their rates at constant
+        speeds.
         """
         g, traced = self.graph, self.build.traced
         at, (raw, simple) = traced.at, self._velocities({})

@@ -8,8 +8,8 @@ A relation is monitored if a rate or its slope differs between the two sides of 
 event may have a dip there, or if its number has no zero between probes. Relations on which a monitored number
 depends are monitored, too. Relations with equal branches, as in guards, are not monitored.
 
-Both branches are evaluated on both sides of zeros between probes, for all decisions of unrelated relations,
-because, for example, the branches of `(x > a) & (y > b)` agree where y < b.
+Both branches are evaluated on both sides of zeros between probes, for all combinations of decisions of
+unrelated relations: the branches of `(x > a) & (y > b)`, for example, agree where y < b.
 
 A rate jumps at a zero if its change does not shrink with the distance between the two sides. Otherwise it has
 a kink.
@@ -138,7 +138,7 @@ def relations(
 
 def _counts(graph: Graph, number: int, decided: Decided, outputs: Sequence[int], excess, probes) -> bool:
     """Return whether a number must be monitored: the branches of its relations differ near a zero, or it has
-    none.
+    no zero.
     """
     least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
     for beside, here in _beside(graph, number, decided, outputs, probes):

@@ -113,8 +113,8 @@ def with_sides(program: Lowered, has_events: bool, modes: tuple[int, ...]) -> Lo
 
 
 def _counted(graph: Graph, old: Graph, first: tuple[int, int], new: dict[int, int]) -> int:
-    """Return the number a whose integer part decides. `first`: one of its relations, and a factor: 1, or -1
-    if -a decides this relation.
+    """Return the number whose integer part decides a relation. `first`: the relation, and 1, or -1 if the
+    negative number decides it.
     """
     node, turned = first
     found = counted(graph, old.op[node], [new[a] for a in old.args[node]])

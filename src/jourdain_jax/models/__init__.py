@@ -1,4 +1,8 @@
-"""Textbook scenes, and their registry by name."""
+"""Textbook scenes, and their registry by name.
+
+A new model is a class in a module about its kind, a line in `__init__.pyi`, and a name in `registry.py`.
+Open `discs.py` first.
+"""
 
 import lazy_loader as _lazy_loader
 

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
+from jourdain_jax.calculus.reals import Number, Numbers, Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z, vec
 from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.coordinates import coordinates, inputs, parameter, speeds
@@ -260,7 +260,7 @@ class TrailerChain(Scene):
         """Return a start: the car turns left, with the trailers straight behind it."""
         return self.towing([0.0] * (self.trailers + 1), forward=1.2, turn=0.4)
 
-    def towing(self, headings, *, forward=0.0, turn=0.0) -> dict[str, Scalar]:
+    def towing(self, headings: Numbers, *, forward: Number = 0.0, turn: Number = 0.0) -> dict[str, Scalar]:
         """Return a start: headings (rad) of the car at the origin and of all trailers, speed (m/s) and turn
         rate (rad/s) of the car.
         """

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole, is_traced
+from jourdain_jax.calculus.reals import Numbers, Parameter, Scalar, Vector3, checked_whole, is_traced
 from jourdain_jax.calculus.rotations import vec
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle, Visual
@@ -199,9 +199,7 @@ class PendulumChain(Heavy):
 
     @property
     def domain(self):
-        """Return the domain: within the reach of the chain; within that of the default lengths where lengths
-        are traced.
-        """
+        """Return the domain: the reach of the chain, with the default lengths in place of traced ones."""
         reach = np.cumsum(np.broadcast_to(0.3 if is_traced(self.length) else self.length, self.links))
         return {f"{axis}{i + 1}": (-r, r) for i, r in enumerate(reach.tolist()) for axis in "xz"}
 
@@ -210,7 +208,7 @@ class PendulumChain(Heavy):
         """Return a straight chain at rest, 60 degrees from hanging."""
         return self.hanging([jnp.pi / 3] * self.links)
 
-    def hanging(self, angles) -> dict[str, Scalar]:
+    def hanging(self, angles: Numbers) -> dict[str, Scalar]:
         """Return coordinates of a chain whose rods have these angles (rad) from straight down, positive
         towards +x.
         """

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from typing import Any
 
 from jourdain_jax import models
 from jourdain_jax.scene.coordinates import Labels, check_name, nearest
@@ -52,7 +53,7 @@ class _Models(Mapping[str, type[Scene]]):
 MODELS = _Models()
 
 
-def model(name: str, **parameters) -> Scene:
+def model(name: str, **parameters: Any) -> Scene:
     """Return a model by name, with the given parameters changed. Raises ValueError, with the valid names, for
     an unknown name.
     """

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Matrix3, Parameter, Scalar, Vector3, real_type
+from jourdain_jax.calculus.reals import Matrix3, Number, Parameter, Scalar, Vector3, real_type
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z, vec
 from jourdain_jax.scene.bodies import RigidBody, Visual
 from jourdain_jax.scene.contact.contacts import disc_contact
@@ -115,7 +115,7 @@ class WhippleBicycle(Scene):
             )
         return cls(**values)
 
-    def upright(self, speed) -> dict[str, Scalar]:
+    def upright(self, speed: Number) -> dict[str, Scalar]:
         """Return the speeds of upright straight running at `speed` (m/s), the steady motion of the linear
         model; all other values are zero.
         """

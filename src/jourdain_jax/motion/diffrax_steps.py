@@ -10,7 +10,7 @@ within one step is missed.
 
 from dataclasses import replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -43,7 +43,7 @@ def _rates(known: tuple, t, y: tuple, args) -> tuple:
 
 
 @shown_from_users_lines
-def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
+def diffrax_term(scene: Scene | BuiltFor, inputs: Any = None) -> "diffrax.ODETerm[Any]":
     """Return the rates of a scene as a term for `diffrax.diffeqsolve`. Its state is (q, u): coordinates and
     all speeds.
 

@@ -55,9 +55,7 @@ def _one_motion(setup: Setup) -> Trajectory:
 
 
 def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
-    """Return the setup in the modes of its contacts, the same setup marked by `_entered`, the zero of these
-    marks, and the start.
-    """
+    """Return the setup in the modes of its contacts, both results of `_entered` for it, and the start."""
     numbers = {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
     # derivatives keep the original types
     given = setup._replace(**in_default_precision(numbers))

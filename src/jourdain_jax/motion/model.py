@@ -49,7 +49,7 @@ class Model(BuiltFor, Printed):
     memory: int | None = None  # limit in bytes for batches of motions and for the records of reverse mode
     made: Any = None  # vector fields and constraint sizes by case, cached by `modelled`
 
-    def replace(self, **parameters) -> "Model":
+    def replace(self, **parameters: Any) -> "Model":
         """Return the model with new values of the named parameters."""
         return replace(self, scene=self.scene.replace(**parameters), made=None)
 
@@ -85,7 +85,7 @@ class Model(BuiltFor, Printed):
 
         return self.once(determined, sizes)
 
-    def inputs(self, given) -> Inputs:
+    def inputs(self, given: Any) -> Inputs:
         """Return inputs given by name; the default is cached."""
         if given is None:
             return self.once("inputs at rest", lambda: as_inputs(self.scene, None))
@@ -130,7 +130,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def dependence(self) -> Dependence:
-        """Return the quantities that depend on time and on the motion."""
+        """Return the quantities that depend on time, and those that change along the motion."""
         known = self.structure
         return Dependence(known.timed, known.driven, known.varying_inertia, known.massless)
 

@@ -116,7 +116,7 @@ class Rollout(Printed, eqx.Module):
         out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
         return out
 
-    def to_xarray(self, units: Mapping[str, str] | None = None):
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> Any:
         """Return coordinates, speeds, result codes and parameters as an `xarray.Dataset`
         along `lane` and `time` (s).
 
@@ -125,7 +125,7 @@ class Rollout(Printed, eqx.Module):
         """
         return labels.to_xarray(self.lanes, units)
 
-    def to_pandas(self):
+    def to_pandas(self) -> Any:
         """Return coordinates and speeds as a `pandas.DataFrame`, one row per sample and time (s). Raises
         ImportError without pandas.
         """

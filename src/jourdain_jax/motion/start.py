@@ -44,6 +44,7 @@ from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.program.evaluate import depend_on
 from jourdain_jax.scene.arguments import (
     BuiltFor,
+    InputLike,
     as_coordinates,
     as_input_vector,
     as_scene,
@@ -60,7 +61,7 @@ _NOTHING: Mapping = MappingProxyType({})
 
 
 def consistent(
-    scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: Labels = ()
+    scene: Scene | BuiltFor, t: Number, q: Numbers, u: Numbers, inputs: InputLike = None, *, held: Labels = ()
 ) -> State:
     """Return the state nearest to (q, u) that satisfies the constraints g(t, q) = 0 and phi(t, q, u) = 0.
     Coordinates are projected by Gauss-Newton steps, speeds orthogonally in the metric of the mass matrix M.

@@ -275,7 +275,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
-    """Append all equations to `steps`, also of inner jaxprs without a custom derivative; return
+    """Append all equations to `steps`, including those of inner jaxprs without a custom derivative; return
     the outputs.
     """
 

@@ -6,6 +6,7 @@ A first call takes a tenth of the time of a compilation.
 from collections.abc import Callable
 from functools import lru_cache, wraps
 from inspect import signature
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +15,8 @@ import numpy as np
 from jourdain_jax.calculus.jaxprs import evaluated, needed_only
 from jourdain_jax.calculus.reals import described, has_unit, is_traced
 from jourdain_jax.program.numpy_backend import applied
+
+F = TypeVar("F", bound=Callable)
 
 
 def eval_numpy(f: Callable) -> Callable:
@@ -51,7 +54,7 @@ def _as_known(x):
     return np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x
 
 
-def eager_if_concrete(f: Callable) -> Callable:
+def eager_if_concrete(f: F) -> F:
     """Run `f` uncompiled if its arguments are concrete, which makes a first call at a prompt ten times
     faster. Otherwise trace it as usual.
 
@@ -68,7 +71,7 @@ def eager_if_concrete(f: Callable) -> Callable:
         return f(*arguments) if is_traced(arguments) else jax.device_put(known(*arguments))
 
     vars(run)["cache_clear"] = vars(known)["cache_clear"]
-    return run
+    return run  # type: ignore[return-value]
 
 
 def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:

@@ -168,7 +168,7 @@ class IdentityProbes:
 
 
 def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
-    """Return whether identity probes evaluate every operation that the nodes need exactly."""
+    """Return whether identity probes evaluate exactly all operations that the nodes need."""
     return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
 
 

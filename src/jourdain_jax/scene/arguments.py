@@ -25,6 +25,8 @@ from jourdain_jax.calculus.compilation import with_usual_promotion
 from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.reals import (
     Entries,
+    Number,
+    Numbers,
     PerCoordinate,
     Scalar,
     Speeds,
@@ -97,7 +99,7 @@ def of_known_numbers(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-def as_time(t) -> Scalar:
+def as_time(t: Number) -> Scalar:
     """Return a time in s, as a number of the default floating-point type."""
     advice = "give one time in s; use `jax.vmap` for many"
     return checked_real(t, "`t`", (), advice=advice).astype(real_type())
@@ -160,6 +162,10 @@ class ChangingInputs(eqx.Module):
     def __call__(self, t) -> Float[Array, "inputs"]:
         """Return the values at a time near `t`."""
         return self.values + self.rates * (t - self.t)
+
+
+# values of inputs at one instant
+InputLike = Numbers | Mapping[str, Any] | ChangingInputs | None
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:

@@ -102,7 +102,14 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def thin_disc(
-        mass, radius, *, axis: str, position, orientation, axial=None, diametral=None
+        mass: Any,
+        radius: Any,
+        *,
+        axis: str,
+        position: Any,
+        orientation: Any,
+        axial: Any = None,
+        diametral: Any = None,
     ) -> "RigidBody":
         """Return a disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
 
@@ -120,7 +127,7 @@ class RigidBody(eqx.Module):
         return RigidBody(mass, _stack(moments), position, orientation, radius * corner[None], "wheel")
 
     @staticmethod
-    def ball(mass, radius, *, position, orientation, factor=0.4) -> "RigidBody":
+    def ball(mass: Any, radius: Any, *, position: Any, orientation: Any, factor: Any = 0.4) -> "RigidBody":
         """Return a ball of the given `radius` (m) with central moment of inertia `factor m r^2` (2/5 when
         solid, 2/3 when hollow).
 
@@ -133,7 +140,7 @@ class RigidBody(eqx.Module):
         return RigidBody(mass, _stack(moments), position, orientation, corner, "ellipsoid")
 
     @staticmethod
-    def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
+    def rod(mass: Any, length: Any, *, axis: str, position: Any, orientation: Any) -> "RigidBody":
         """Return a thin uniform rod of the given `length` l (m) along the body axis `axis` ("x", "y" or "z").
         Its moments about the other axes are `m l^2/12`.
 
@@ -149,7 +156,7 @@ class RigidBody(eqx.Module):
         return RigidBody(mass, _stack(moments), position, orientation, length * ends)
 
     @staticmethod
-    def box(mass, sides, *, position, orientation) -> "RigidBody":
+    def box(mass: Any, sides: Any, *, position: Any, orientation: Any) -> "RigidBody":
         """Return a uniform cuboid with the three `sides` (m) along the body axes.
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
@@ -222,19 +229,19 @@ class Visual(eqx.Module):
     opacity: float = static(default=1.0)
 
     @staticmethod
-    def ball(radius, **look: Unpack[Look]) -> "Visual":
+    def ball(radius: Any, **look: Unpack[Look]) -> "Visual":
         """Return a ball of the given `radius` (m). Its octants alternate in colour, which shows rotation.
         `look`: see `Visual`.
         """
         return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
     @staticmethod
-    def ellipsoid(semi_axes, **look: Unpack[Look]) -> "Visual":
+    def ellipsoid(semi_axes: Any, **look: Unpack[Look]) -> "Visual":
         """Return an ellipsoid with three `semi_axes` (m) along its axes; `look`: see `Visual`."""
         return shape("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), **look)
 
     @staticmethod
-    def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
+    def wheel(radius: Any, width: Any = None, *, axis: str = "y", **look: Unpack[Look]) -> "Visual":
         """Return a wheel or disc of `radius` and `width` (m; default: a sixth of the radius) about `axis`
         ("x", "y" or "z"). Its quarters alternate in colour. `look`: see `Visual`.
         """
@@ -243,12 +250,12 @@ class Visual(eqx.Module):
         return _about(axis, "wheel", [radius, width], **look)
 
     @staticmethod
-    def box(sides, **look: Unpack[Look]) -> "Visual":
+    def box(sides: Any, **look: Unpack[Look]) -> "Visual":
         """Return a box with three `sides` (m) along its axes; `look`: see `Visual`."""
         return shape("box", _lengths(sides, "sides of a box", (3,)), **look)
 
     @staticmethod
-    def cylinder(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
+    def cylinder(radius: Any, length: Any, *, axis: str = "z", **look: Unpack[Look]) -> "Visual":
         """Return a cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look`:
         see `Visual`.
         """
@@ -256,7 +263,7 @@ class Visual(eqx.Module):
         return _about(axis, "cylinder", [radius, _lengths(length, "length of a cylinder", ())], **look)
 
     @staticmethod
-    def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
+    def capsule(radius: Any, length: Any, *, axis: str = "z", **look: Unpack[Look]) -> "Visual":
         """Return a cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look`:
         see `Visual`.
         """
@@ -264,7 +271,7 @@ class Visual(eqx.Module):
         return _about(axis, "capsule", [radius, _lengths(length, "length of a capsule", ())], **look)
 
     @staticmethod
-    def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
+    def line(*points: Any, radius: Any = None, colour: Any = None, opacity: float = 1.0) -> "Visual":
         """Return a bar of round section from each of the `points` (m, body frame) to the next.
 
         `radius` in m (default: thin); `colour`, `opacity`: see `Visual`.
@@ -280,7 +287,9 @@ class Visual(eqx.Module):
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
 
     @staticmethod
-    def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
+    def coil(
+        a: Any, b: Any, radius: Any, *, turns: int = 8, colour: Any = None, opacity: float = 1.0
+    ) -> "Visual":
         """Return a spring between two points `a`, `b` (m, body frame): a wire with a number of `turns` and a
         `radius` (m). `colour`, `opacity`: see `Visual`.
         """
@@ -299,7 +308,7 @@ class Visual(eqx.Module):
         return _checked(Visual("line", points, jnp.zeros(3), jnp.eye(3), radius / 6, None, colour, opacity))
 
     @staticmethod
-    def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
+    def mesh(vertices: Any, faces: Any, *, scale: Any = 1.0, **look: Unpack[Look]) -> "Visual":
         """Return a body with flat faces.
 
         `vertices`: (points, 3) in m; `faces`: for each face a list of vertex indices, anticlockwise seen from
@@ -323,7 +332,7 @@ class Visual(eqx.Module):
         return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
     @staticmethod
-    def from_file(path: str | os.PathLike[str], *, scale=1.0, **look: Unpack[Look]) -> "Visual":
+    def from_file(path: str | os.PathLike[str], *, scale: Any = 1.0, **look: Unpack[Look]) -> "Visual":
         """Return the mesh in the file `path`, in a format of `trimesh`, such as .stl or .obj.
 
         `scale`: factor, 0.001 for millimetres; `look`: see `Visual`. Raises ImportError without

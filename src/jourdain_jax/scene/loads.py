@@ -309,7 +309,12 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
 
 
 def weld(
-    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None
+    first: BodyPose,
+    second: BodyPose,
+    *,
+    at_first: Any = (0.0, 0.0, 0.0),
+    at_second: Any = (0.0, 0.0, 0.0),
+    turn: Any = None,
 ) -> Float[Array, "6"]:
     """Return the geometric constraints (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 

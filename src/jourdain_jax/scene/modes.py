@@ -71,7 +71,7 @@ class Modes:
         return value
 
 
-def modes(**values) -> Modes:
+def modes(**values: Any) -> Modes:
     """Declare modes: name -> names of its values. A motion starts with the first value.
 
     `motion.modes.name` is the number of the value: constant between events, and switched by

@@ -9,14 +9,16 @@ and do not affect S. Source: C. Rucker and P. M. Wensing, IEEE Robotics and Auto
 eqs. (10)-(13).
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, largest
+from jourdain_jax.calculus.reals import Matrix3, Numbers, checked_real, known_numbers, largest
 
 
-def inertia_from_log_cholesky(numbers) -> Matrix3:
+def inertia_from_log_cholesky(numbers: Numbers) -> Matrix3:
     """Return an inertia matrix (3, 3) about the mass centre, in kg m^2, that is physically possible for all
     `numbers`. It is differentiable at all numbers.
 
@@ -53,7 +55,7 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
     return jnp.trace(S) * jnp.eye(3, dtype=S.dtype) - S
 
 
-def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]:
+def log_cholesky(inertia: Any, *, symmetric: bool = False) -> Float[Array, "numbers"]:
     """Return the numbers (6,) from which `inertia_from_log_cholesky` computes this `inertia`: a matrix (3, 3)
     or three principal moments, in kg m^2, about the mass centre.
 

@@ -10,6 +10,8 @@ The third derivative is continuous at the second and the second-last knot ("not 
 curve is no substitute: its second derivative is zero between knots, so its motion has no inertia force.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,10 +46,10 @@ class Spline(eqx.Module):
     ts: Float[Array, "samples"]  # s
     values: Float[Array, "samples"]
 
-    def __init__(self, ts, values):
+    def __init__(self, ts: Any, values: Any):
         self.ts, self.values = checked_samples("Spline", ts, values, 2, "coordinate")
 
-    def __call__(self, t):
+    def __call__(self, t: Any) -> Array:
         """Return the value at time t (s)."""
         return smooth_through_samples(jnp.asarray(t, real_type()), self.ts, self.values)
 

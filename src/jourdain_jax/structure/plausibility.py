@@ -244,7 +244,7 @@ CHECKS = (
             f"{_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z or "
             "jj.quaternion_to_matrix"
         ),
-        "an orientation that is no rotation",
+        "an orientation that is not a rotation",
     ),
     Check(
         "orientation",
@@ -290,7 +290,7 @@ CHECKS = (
         "restitution",
         lambda x: (x < 0) | (x > 1),
         lambda x: f"is {x:.4g}, expected a number from 0 to 1",
-        "a restitution that is not from 0 to 1",
+        "a restitution outside 0 to 1",
     ),
     _unit("gravity", "gravity"),
     Check(

@@ -43,7 +43,7 @@ class Scaled(eqx.Module):
 
 
 def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
-    """Return `d A c` with the scales used for accelerations (`scaling.row_scale`)."""
+    """Return `d A c` with the scales used for accelerations (`equations/reductions.py: row_scale`)."""
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])

@@ -1,5 +1,5 @@
 """States of a scene's domain, projected onto its constraints: random states, and symmetric configurations
-(zero and right angles). At these a partition of the speeds may be singular that is regular at random states.
+(zero and right angles). A partition of the speeds that is regular at random states may be singular at these.
 """
 
 import itertools

@@ -21,7 +21,7 @@ Numbers = dict[str, dict[str, Float[Array, "*states_and_shape"]]]
 
 
 def numbers_of(scene: Scene, motion: Motion) -> Numbers:
-    """Return the checked numbers at the state of a motion."""
+    """Return the numbers that `plausibility.py` checks, at the state of a motion."""
     pose = motion.pose()
     contacts = contacts_of(scene, pose)
     laws = {f"contact `{name}`": c.friction for name, c in contacts.items() if c.friction is not None}
@@ -41,7 +41,7 @@ def numbers_of(scene: Scene, motion: Motion) -> Numbers:
 
 
 def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers:
-    """Return the checked numbers that depend on poses and loads only."""
+    """Return the checked numbers that depend only on poses and loads."""
     bodies = {f"body `{name}`": body.body for name, body in pose.bodies.items()}
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}

@@ -78,8 +78,8 @@ class MeanGradients(Printed):
 
 
 def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
-    """Return the gradients of the means of all outputs of a task. `shared`: names of parameters, equal in all
-    samples, with respect to which to differentiate as well.
+    """Return the gradients of the means of all outputs of a task. `shared`: names of parameters that are
+    equal in all samples, for further derivatives.
     """
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
@@ -111,7 +111,7 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
     known = {name: np.ndim(value) for name, value, _ in parameters_of(task.scene)}
     for name in shared:
         if name not in known or name in task.design.names:
-            said = "varies over the samples; omit it" if name in known else "is no parameter of the scene"
+            said = "varies over the samples; omit it" if name in known else "is not a parameter of the scene"
             raise ValueError(
                 f"`{name}` {said}; {nearest(name, [one for one in known if one not in task.design.names])}"
             )

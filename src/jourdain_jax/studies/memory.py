@@ -45,8 +45,8 @@ def give_back_at_once() -> None:
 
 
 def of_each(memory: int, processes: int) -> int:
-    """Return the bytes for each computing process. All of them share `memory`, and if there are several, this
-    process has a share, too.
+    """Return the bytes for each computing process. Several processes share what this process leaves of
+    `memory`.
     """
     return memory if processes == 1 else max(0, (memory - resident()) // processes)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -199,7 +200,7 @@ class StudyResult(Printed):
         check_name(output, self.outputs, f"the study has no output `{output}`")
         return self.outputs.index(output)
 
-    def to_xarray(self):
+    def to_xarray(self) -> Any:
         """Return all arrays as an `xarray.Dataset` with names and units, read on use. Unfinished samples are
         NaN and have the result -1.
 
@@ -347,7 +348,7 @@ def merge_studies(path: FilePath, shares: Sequence[FilePath]) -> StudyResult:
             grid, own = other.read_grid(), target.read_grid()
             if different or (grid and own and grid != own):
                 raise ValueError(
-                    f"`{share}` holds no share of the study in `{path}`: "
+                    f"`{share}` is not a share of the study in `{path}`: "
                     f"{' and '.join(different) or 'the grid of statistics'} differ"
                 )
             if grid and not own:

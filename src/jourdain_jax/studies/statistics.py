@@ -28,6 +28,7 @@ bootstrap), times the normal quantile of the confidence.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -281,7 +282,7 @@ class SobolIndices(Printed):
         return "\n".join(lines)
 
 
-def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> SobolIndices:
+def sobol_indices(values: Any, names: Sequence[str], *, confidence: float = 0.95) -> SobolIndices:
     """Return Sobol' indices of a quantity from its `values` on a design with sampler "saltelli", whose
     variables are called `names`.
 
@@ -292,7 +293,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
 
     `confidence`: of each interval. Groups with a value that is not finite are omitted and counted; if they
     are many or not random, the indices describe only the rest. Raises ValueError if the number of values is
-    no multiple of variables + 2, or if nothing varies.
+    not a multiple of variables + 2, or if nothing varies.
     """
     values, names = np.asarray(values, float), tuple(names)
     group = len(names) + 2

@@ -176,8 +176,8 @@ class Store:
         return found
 
     def _read_manifest(self) -> dict[str, str]:
-        """Return the digests of the files that are written once, by name, after checking that each file
-        exists and matches. The grid is exempt, since it can be computed again.
+        """Return the digests, by name, of files that are written once. Each file must exist and match, except
+        the grid, which can be computed again.
         """
         found = self._json(MANIFEST)
         digests = found.get("digests")

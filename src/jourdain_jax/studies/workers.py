@@ -206,7 +206,7 @@ def _end_with(parent: int) -> None:
 
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
-    """Return the `workers` argument of `run.run` for a cluster. Raises ValueError if `client` is no Dask
+    """Return the `workers` argument of `run.run` for a cluster. Raises ValueError if `client` is not a Dask
     client, or if the task cannot be sent to another process.
     """
     distributed = needed("distributed", "a cluster", "cluster")

@@ -4,6 +4,7 @@ imaginary axis.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,9 +45,9 @@ def stability_chart(
     axes: Mapping[str, tuple[Number, Number]],
     *,
     guess: Mapping[str, float] | None = None,
-    prior: Mapping | None = None,
+    prior: "Mapping[str, Any] | None" = None,
     points: int = 101,
-    **asked,
+    **asked: Any,
 ) -> StabilityChart:
     """Return the boundaries of stability of steady motions in a plane of two quantities.
 

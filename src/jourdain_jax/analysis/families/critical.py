@@ -191,7 +191,7 @@ def _solution(special: Special, scene: Scene, near: Unknowns, inverse, condition
 
 
 class _Followed(NamedTuple):
-    """Point that has been followed through a share `done` of the change of the parameters."""
+    """Point reached after a fraction `done` of the change of the parameters."""
 
     X: Unknowns
     done: Scalar
@@ -238,7 +238,7 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 
 @followed_to.def_vmap
 def _in_blocks(count: int, of_samples: list, *batch):
-    """Follow few samples together, because the number of steps differs between them."""
+    """Follow samples in small blocks, because their numbers of steps differ."""
     moving, fixed = eqx.partition([*batch], of_samples)
     # the last sample fills the last block, so that only whole blocks are compiled
     places = np.minimum(np.arange(count + -count % 8), count - 1)

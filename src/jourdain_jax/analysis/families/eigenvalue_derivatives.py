@@ -118,7 +118,7 @@ def _held(equations: SteadyEquations, look: Look, named: Labels) -> list[int]:
             chosen.append(k)
     if not len(chosen) == count >= len(named):
         raise ValueError(
-            f"the steady motions near this one have {count} freedoms; name {count} quantities "
-            f"in `held` that distinguish them ({', '.join(named)} do not)"
+            f"the steady motions near this one have {count} degrees of freedom; name {count} "
+            f"quantities in `held` that distinguish them ({', '.join(named)} do not)"
         )
     return chosen

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -152,7 +153,7 @@ class Family(Printed):
         state, values = known.state(known.at(point.z), largest(point.look.R)), known.values(point.z)
         return FamilyPoint(kind, state, point.modes, modes, values, point.tangent * known.size, known.modes)
 
-    def to_xarray(self):
+    def to_xarray(self) -> Any:
         """Return all points as an `xarray.Dataset`: unknowns, `stable`, and eigenvalues with mode names."""
         xarray = needed("xarray", "a family as labelled arrays")
         values = {name: ("point", self[name]) for name in self.equations.unknowns}
@@ -193,17 +194,17 @@ class Family(Printed):
 @shown_from_users_lines
 def family(
     scene: Scene | BuiltFor,
-    guess: "State | Mapping | FamilyPoint | PeriodicMotion",
+    guess: "State | Mapping[str, Any] | FamilyPoint | PeriodicMotion",
     *,
     until: Mapping[str, float] | None = None,
     vary: str | None = None,
     held: str | Labels = (),
     names: Labels | None = None,
-    inputs: Numbers | dict | None = None,
+    inputs: Numbers | Mapping[str, Any] | None = None,
     max_points: int = 4000,
 ) -> Family:
     """Return the family of steady motions through the steady motion near a guess, or a family of periodic
-    motions. Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`; one freedom remains.
+    motions. Steady motions satisfy `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0`; one degree of freedom remains.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
         print(turns)    # folds, branch points, changes of stability, why the curve ends

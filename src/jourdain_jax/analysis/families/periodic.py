@@ -18,7 +18,7 @@ Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -113,7 +113,7 @@ class PeriodicMotion(Printed, eqx.Module):
 @shown_from_users_lines
 def periodic(
     scene: Scene | BuiltFor,
-    guess: "State | dict",
+    guess: "State | Mapping[str, Any]",
     period: Number,
     *,
     until: str | None = None,

@@ -9,7 +9,7 @@
 A test function may change its sign twice within a step. Therefore, if it keeps its sign but the parabola
 through three neighbours nearly vanishes, it is evaluated there.
 
-Continue a curve of steady motions: find its start, its points, its ends and its special points.
+The module also finds the start of a curve of steady motions, and follows it to its ends.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -187,8 +187,8 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
     count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
     if count == 0:
         raise ValueError(
-            f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold "
-            "fewer quantities, or name a parameter in `vary`"
+            f"this {equations.what[:-1]} of `{scene}` is isolated: no degree of freedom is left; "
+            "hold fewer quantities, or name a parameter in `vary`"
         )
     if count > 1:
         free = [

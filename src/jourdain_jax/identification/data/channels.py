@@ -34,6 +34,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import (
     Scalar,
     Shape,
+    Vector,
     Vector3,
     array_module,
     check_kind,
@@ -167,7 +168,7 @@ class Accelerometer(Instrument):
     point: Vector3  # m
     gravity: Vector3  # m/s^2
 
-    def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
+    def __init__(self, body: str, point: Vector = (0.0, 0.0, 0.0), gravity: Vector = (0.0, 0.0, -9.81)):
         check_kind(body, str, "`body` of `Accelerometer`", "the name of a body")
         self.body = body
         advice = "give three components in the body's frame, m"
@@ -215,7 +216,7 @@ class LoadCell(Instrument):
 
     contact: str = static()
 
-    def __init__(self, contact):
+    def __init__(self, contact: str):
         check_kind(contact, str, "`contact` of `LoadCell`", "the name of a contact")
         self.contact = contact
 

@@ -161,7 +161,7 @@ class Correlated:
     covariance: np.ndarray  # of all these numbers
 
 
-def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
+def joint_normal(mean: Mapping[str, float], covariance: Any) -> dict[str, Correlated]:
     """Return priors of several parameters with correlated errors:
     `free=jj.identification.joint_normal({"mass": 20.9, "inertia": 1.64}, covariance)`.
 
@@ -170,9 +170,8 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     - `covariance`: (n, n), in the order of the names. It may be singular: a combination of zero variance gets
       a ten thousandth of the standard deviation of the others.
 
-    **Returns** name -> prior, for `free` of `fit`, alone or together with others:
-    `free=jj.identification.joint_normal(...)
-    | {"gain": None}`. If only some of the names are free, their block of the covariance is used.
+    **Returns** `joint`, name -> prior, for `free` of `fit`, alone or with others:
+    `free=joint | {"gain": None}`. If only some of the names are free, their block of the covariance is used.
     `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
     **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or
@@ -212,8 +211,8 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
 
 
 def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
-    """Return M for numbers with these priors (None, or a mean and a sigma). It is the identity except for
-    numbers that were measured together.
+    """Return the matrix M of the module docstring for numbers with these priors (None, or a mean and a
+    sigma). Numbers that were not measured together have rows of the identity.
     """
     M = np.eye(len(priors))
     together: dict[int, list[int]] = {}

@@ -1,5 +1,5 @@
-"""An experiment: the measurements of one run. It has times, named channels, each with a sigma and a sensor, a
-start, and sampled inputs.
+"""An experiment: the measurements of one run. It has times, a start, sampled inputs, and named channels with
+a sigma and a sensor each.
 
     value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 
@@ -7,6 +7,7 @@ start, and sampled inputs.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -313,7 +314,7 @@ class Experiment(eqx.Module):
     # Equinox's `__getattribute__` costs a microsecond per access, and a fit reads a hundred fields
     __getattribute__ = object.__getattribute__
 
-    def changed(self, **fields) -> "Experiment":
+    def changed(self, **fields: Any) -> "Experiment":
         """Return this run with some fields replaced, without checking it again."""
         found = object.__new__(type(self))
         vars(found).update(vars(self) | fields)

@@ -166,8 +166,8 @@ def moved_from_bounds(
         if far:
             bounded = labels[int(np.searchsorted(places, place))]
             sentences.append(
-                f"{_too_narrow(far)}: with `{bounded}` off its bound, within its interval, the best fit lies "
-                f"outside; {ADVICE}"
+                f"{_too_narrow(far)}: if `{bounded}` leaves its bound within its interval, the best fit lies "
+                f"outside of them; {ADVICE}"
             )
     return sentences
 

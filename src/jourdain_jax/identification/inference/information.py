@@ -174,10 +174,11 @@ def information(
 
 
 def least_move(cutoff: float, largest):
-    """Return the change, in standard errors, below which an unknown does not take part in an undetermined
+    """Return the smallest change, in standard errors, by which an unknown takes part in an undetermined
     direction.
 
-    An error of cutoff * (largest singular value) in J rotates such a direction by this many standard errors.
+    Errors of J up to `cutoff * largest` rotate such a direction by this much; `largest`: the largest singular
+    value.
     """
     # standard errors: an unknown that moves this far along an undetermined direction takes part in it
     return np.maximum(0.1, cutoff * largest)

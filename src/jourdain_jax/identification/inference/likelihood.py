@@ -37,7 +37,16 @@ from jourdain_jax.analysis.linear_matrices import (
     privileged_at,
     privileged_speeds,
 )
-from jourdain_jax.calculus.reals import Indices, PerCoordinate, Scalar, Speeds, checked_real, holds, real_type
+from jourdain_jax.calculus.reals import (
+    Indices,
+    Number,
+    PerCoordinate,
+    Scalar,
+    Speeds,
+    checked_real,
+    holds,
+    real_type,
+)
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.identification.data.channels import Channel, Instrument, StopEvent
 from jourdain_jax.identification.data.delay_filter import gauss_legendre
@@ -126,7 +135,7 @@ def filtered_log_likelihood(
     scene: Scene | BuiltFor,
     data: Data,
     *,
-    process_noise: Mapping,
+    process_noise: "Mapping[str, Number]",
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> Scalar:
@@ -151,7 +160,7 @@ def filtered_log_likelihood(
     mode (`jax.jacfwd`), also under `jit` and `vmap`. It is -inf if the motion fails. Make sensors outside of
     `jit`, since a traced delay cannot be checked.
 
-    **Raises** ValueError for a name that is no independent speed, intensities below zero, quaternions,
+    **Raises** ValueError for a name that is not an independent speed, intensities below zero, quaternions,
     sensors with a delay or lag, accelerometers, noise with a correlation time, and unknown numbers.
 
     **Example**

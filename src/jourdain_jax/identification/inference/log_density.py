@@ -132,7 +132,7 @@ class LogDensity(eqx.Module):
         theta = self.constrain(z)
         return {label: theta[..., i] for i, label in enumerate(self.labels)}
 
-    def unconstrain(self, values: Mapping) -> Point:
+    def unconstrain(self, values: "Mapping[str, Any]") -> Point:
         """Return z for these values of unknowns by name, in their units. Omitted unknowns have their first
         guess.
 
@@ -199,8 +199,8 @@ class LogDensity(eqx.Module):
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
 
     def to_arviz(self, z: Array | np.ndarray):
-        """Return draws z of a sampler as `arviz.InferenceData`: the unknowns in their units by name, measured
-        values, and the logarithm of the density of each of them, for `arviz.loo`.
+        """Return draws z of a sampler as `arviz.InferenceData`: the unknowns by name in their units, the
+        measured values, and the log density of each measured value, for `arviz.loo`.
 
         Channels of several runs are named `"run 0: lean"`. Missing samples are omitted. Raises ImportError
         without ArviZ, and ValueError unless z has the axes chains, draws and unknowns.

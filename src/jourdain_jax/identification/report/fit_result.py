@@ -93,8 +93,8 @@ class Fit(Estimates):
           `Fit.profiles`.
         - `units`: channel -> unit, for labels, such as `{"x": "m"}`; a scene has units only for parameters.
 
-        Raises ValueError for a path that is no .html file, a batch or a failed fit, and other data than the
-        fit's.
+        Raises ValueError for a path that does not end in .html, a batch or a failed fit, and other data than
+        the fit's.
         """
         runs, others = ((x,) if isinstance(x, Experiment) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):

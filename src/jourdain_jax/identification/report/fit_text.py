@@ -40,8 +40,8 @@ def _of_the_minimum(fit: Estimates) -> Iterator[str]:
     """
     if fit.stuck:
         yield (
-            "no step improves the fit, but this is no minimum: nearby the motion fails, or is rougher than "
-            "its tolerance; use another first guess"
+            "no step improves the fit, but this is not a minimum: nearby the motion fails, or is rougher "
+            "than its tolerance; use another first guess"
         )
     elif fit.shooting is not None and fit.shooting.continuity > 1:
         jump = float(fit.shooting.continuity)
@@ -149,7 +149,7 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """Return a limit of the mean square of normal residuals, this many standard deviations from 1. Its cube
+    """Return the mean square of normal residuals that is `deviations` standard deviations from 1. Its cube
     root is nearly normal (Wilson and Hilferty). `spread`: the standard deviation of the mean square.
     """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
@@ -178,8 +178,8 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
 
 
 def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
-    """Return the mean square of residuals that determined `determined` unknowns, and its standard deviation
-    for normal residuals. If `robust`, the mean square is computed from the median.
+    """Return the mean square of residuals from which `determined` unknowns were estimated, and its standard
+    deviation if residuals are normal. If `robust`, the mean square is computed from the median.
     """
     degrees = max(squares.size - determined, 1)
     # the median of w^2 is 0.4549 for a normal w; its relative standard deviation for n residuals is 2.33 /

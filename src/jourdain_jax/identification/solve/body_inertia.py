@@ -179,10 +179,9 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
             for entry in diagonal
         )
         raise ValueError(
-            f"no body of nonzero thickness has the moments of inertia of body `{name}` of "
-            f"`{type(scene).__name__}`, {moments} kg m^2, and its products of inertia: principal moments "
-            "must be positive, each less than the sum of the other two; for a flat body, reduce the largest "
-            "slightly"
+            f"no body of nonzero thickness has the inertia of body `{name}` of `{type(scene).__name__}`, "
+            f"with the moments {moments} kg m^2: principal moments must be positive, each less than the sum "
+            "of the other two; for a flat body, reduce the largest slightly"
         )
     return found
 

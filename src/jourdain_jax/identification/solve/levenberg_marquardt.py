@@ -14,8 +14,8 @@ in 256. optimistix is not used, because its Jacobian is dense (each run would be
 to the starts of all others), it has no bounds, and it evaluates residuals and derivatives separately.
 
 Several problems of one shape (`members`) run as a batch; finished members are not evaluated. Source: D. W.
-Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near
-the minimum slopes instead of values: W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
+Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; for the
+use of slopes instead of values near the minimum, W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 
 A `Loss` rho(r) grows like r^2 for small residuals r, and more slowly for outliers:
 

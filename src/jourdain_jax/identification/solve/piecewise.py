@@ -233,8 +233,8 @@ class Piecewise(Problem):
             yield b, j, closed(rows, self.own + self.shared)
 
     def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
-        """Return Jacobian and residuals [J g r] of whole runs after a share of the gaps is closed. g is the
-        change of r when all gaps are closed.
+        """Return Jacobian and residuals [J g r] of whole runs after a fraction of each gap is closed. g is
+        the change of r when all gaps are closed.
         """
         return self._of_runs(members, ~self._move(theta, members, share))
 

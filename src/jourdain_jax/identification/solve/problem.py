@@ -212,8 +212,8 @@ class Problem:
     def is_followed(
         self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float
     ) -> Bool[np.ndarray, "members shares"]:
-        """Return whether the mean squared residual over each of these shares of the runs is at most `most`
-        times that of noise.
+        """Return whether the mean squared residual of the runs, up to each of these fractions of their spans,
+        is at most `most` times that of noise.
         """
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))

@@ -165,7 +165,7 @@ class ArrayWriter:
         self._within(rooms, found, lambda: None)
 
     def seldom(self, condition: Array | bool, body: Callable[[], object]) -> None:
-        """Run the body, which changes no lane in which the condition does not hold: for XLA a branch costs
+        """Run the body, which changes only lanes in which the condition holds. Under XLA a branch would cost
         more than a short body.
         """
         body()

@@ -96,7 +96,7 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
-    """Write `begin(job, state, who, lane)`, which begins in a lane the sample whose index `who` states."""
+    """Write `begin(job, state, who, lane)`, which begins a sample in a lane; `who` holds its index."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = w.load(who, lane, "i64")
         begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
@@ -314,7 +314,7 @@ Unknowns = Float[Array, "z"]
 
 @jax.custom_jvp
 def _to_second_order(d: Scalar, dz: Unknowns) -> Unknowns:
-    """Return `dz`, a second derivative, which JAX cannot differentiate with respect to the time d."""
+    """Return `dz`, and raise an error if JAX differentiates it with respect to the time `d`."""
     return dz
 
 

@@ -22,7 +22,7 @@ class MachineWriter(Writer):
     its own way:
 
         if_any(c, body)            run the body if c holds in any lane; the body selects lanes by `where`
-        seldom(c, body)            the same, for a body that changes no lane in which c does not hold
+        seldom(c, body)            the same, for a body that changes only lanes in which c holds
         over_stages(n, body, x)    x <- body(i, x) for all stages i
         each(rows, body)           run the body for each row, independently
     """

@@ -4,7 +4,7 @@ The derivative of a motion is a motion whose state includes tangents. The loop i
 an event's time; all other times are constant here (`native_motion.py`). Tolerances, the first step and
 samples have no derivatives.
 
-Input and output of a loop over steps, in machine code and in JAX.
+`Start` and `Found` are the input and output of a loop, in machine code and in JAX.
 """
 
 import math

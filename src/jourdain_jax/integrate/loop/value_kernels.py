@@ -93,7 +93,7 @@ def called(
         return call(2, 1, (), tuple(map(jnp.ndim, jax.tree.leaves(arguments))), arguments)
 
     @run.def_vmap
-    def run_many(count, batched: list[bool], *arguments):
+    def run_many(count, batched: list, *arguments):
         ranks = tuple(
             x.ndim - has_axis for x, has_axis in zip(*map(jax.tree.leaves, (arguments, batched)), strict=True)
         )
@@ -185,8 +185,8 @@ def nodes_called(
     graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1, moved: Collection[int] = ()
 ) -> Callable[..., Array]:
     """Return a function from values of variables, in vectors and numbers, to values of nodes, by machine
-    code. If variables are `moved`, two more arguments are rtol and atol, and the values at the state `off`
-    follow.
+    code. With `moved` variables, it also takes rtol and atol, and then returns the values for these variables
+    increased by a tolerance (`off`).
     """
     states = 2 if moved else 1
 
@@ -206,8 +206,8 @@ def nodes_called(
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[..., Array]:
     """Return the same function as `nodes_called`, with derivatives. Nodes that are structurally zero cost
-    nothing. An argument may be a pair of equal arrays, the second possibly in several parts: machine code
-    takes the second, whose parts lanes may share, and derivatives are with respect to the first.
+    nothing. An argument may be a pair of equal arrays: derivatives are with respect to the first; machine
+    code takes the second, which may consist of parts that lanes share.
     """
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])

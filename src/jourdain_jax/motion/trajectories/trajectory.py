@@ -3,6 +3,7 @@ show.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.compilation import nan_is_a_mark
 from jourdain_jax.calculus.figures import MODEL, figure
 from jourdain_jax.calculus.markers import nan_where
-from jourdain_jax.calculus.reals import checked_real
+from jourdain_jax.calculus.reals import Vector, checked_real
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
@@ -149,7 +150,7 @@ class Trajectory(Record, Printed):
         """Return poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return map_over_times(motion_at, self)
 
-    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
+    def point(self, body: str, local: Vector = (0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
         """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates
         `local` (m, from the mass centre).
         """
@@ -194,7 +195,7 @@ class Trajectory(Record, Printed):
         """
         return map_over_times(values_in_time.invariants, self)
 
-    def to_xarray(self, units: Mapping[str, str] | None = None):
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> Any:
         """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
         `units`: units of coordinates and speeds by name, stored as `attrs["units"]`; a scene states only
@@ -202,7 +203,7 @@ class Trajectory(Record, Printed):
         """
         return labels.to_xarray(self, units)
 
-    def to_pandas(self):
+    def to_pandas(self) -> Any:
         """Return coordinates and speeds as a `pandas.DataFrame`, one row per time (s). Raises ImportError
         without pandas.
         """

@@ -41,7 +41,7 @@ class Coulomb(eqx.Module):
     sliding: Scalar
     static: Scalar
 
-    def __init__(self, sliding, static=None):
+    def __init__(self, sliding: Any, static: Any = None):
         self.sliding = checked_real(sliding, "coefficient of friction", ())
         static = self.sliding if static is None else static
         self.static = checked_real(static, "coefficient of static friction", ())

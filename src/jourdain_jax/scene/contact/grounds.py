@@ -12,7 +12,7 @@ scene is probed.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import (
     Matrix3,
+    Number,
     Scalar,
     Vector,
     Vector3,
@@ -101,8 +102,8 @@ class Plane(_Ground):
 
     def __init__(
         self,
-        origin=(0.0, 0.0, 0.0),
-        tilt=None,
+        origin: Vector = (0.0, 0.0, 0.0),
+        tilt: Any = None,
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
         *,
@@ -289,7 +290,7 @@ class HeightMap(_Ground):
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
         self._moves("a height map", **motion)
 
-    def height_at(self, x, y) -> Scalar:
+    def height_at(self, x: Number, y: Number) -> Scalar:
         """Return h (m) at `x`, `y` (m)."""
         return checked_real(self.h(x, y), "h(x, y) of a height map", (), advice="return one height, m")
 
@@ -309,7 +310,7 @@ class HeightMap(_Ground):
         normal = normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
         return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
-    def point_at(self, x, y) -> Vector3:
+    def point_at(self, x: Number, y: Number) -> Vector3:
         """Return the point (m, inertial frame) of the surface at `x`, `y` (m)."""
         return jnp.stack([as_real(x), as_real(y), self.height_at(x, y)])
 
