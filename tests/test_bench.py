@@ -28,7 +28,7 @@ from hunting.reference import integrate
 from hunting.table import as_markdown, figures, losses
 from numpy.testing import assert_allclose
 from solved_states import over_states
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.equations import coordinate_rates
@@ -263,7 +263,7 @@ def _solved(name):
 def _assert_equal(found, expected, among=None):
     """At each state, up to round-off of the largest rate there, or of the largest in `among`."""
     largest = np.max(np.abs(expected if among is None else among), axis=1)
-    assert np.max(np.max(np.abs(found - expected), axis=1) / largest) < tolerance("round_off")
+    assert np.max(np.max(np.abs(found - expected), axis=1) / largest) < ROUND_OFF
 
 
 def _columns(states):
@@ -316,9 +316,10 @@ def test_dense_and_flat_equations_run_the_disc_to_the_same_end():
         static_argnums=0,
     )
     by_hand = run(flat.disc_rates, starts)
-    assert relative_error(
-        run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand
-    ) < tolerance("closed_form")
+    assert (
+        relative_error(run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand)
+        < CLOSED_FORM
+    )
 
 
 @pytest.mark.parametrize("width", [1, 4])
@@ -329,7 +330,7 @@ def test_heyoka_runs_the_disc_to_the_same_end(width):
             heyoka_disc.system()
         pytest.skip(heyoka_lowered.MISSING)
     run = heyoka_lowered.final_states(heyoka_disc.system(), disc_run.END, 1e-13, width)
-    assert disc_run.error(run(starts), disc_run.reference(starts)) < tolerance("closed_form")
+    assert disc_run.error(run(starts), disc_run.reference(starts)) < CLOSED_FORM
 
 
 def test_operations_are_counted_after_common_subexpressions():

@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from oracles import whipple_bicycle as oracle
 from oracles.hang_lines import mean_of_intersections
+from refusals import refused
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import (
@@ -225,8 +226,7 @@ def test_a_measured_bicycle_is_a_scene_and_a_prior():
     design = jj.Study(bicycle.scene, vary=bicycle.prior, sampler="sobol", samples=1024).design
     trail = design.values()["c"]
     assert_allclose([np.mean(trail), np.std(trail)], [bicycle.values["c"], bicycle.sigmas["c"]], rtol=0.01)
-    with pytest.raises(ValueError, match=r"no measured bicycle `Browsr`.*Browser"):
-        measured_bicycle("Browsr")
+    refused(r"no measured bicycle `Browsr`.*Browser", measured_bicycle, "Browsr")
 
 
 FLAT = "# a set of parameters\n---\n" + "".join(
@@ -400,9 +400,8 @@ def test_a_study_takes_measurements_and_its_limits_are_narrower(tmp_path):
 
 
 def test_the_command_takes_measurements_by_name(tmp_path, capsys):
-    assert (
-        main(["bicycle", "BrowserMeasured", "--samples", "60", "--no-figures", "--out", str(tmp_path)]) == 0
-    )
+    command = ["bicycle", "BrowserMeasured", "--samples", "60", "--no-figures", "--out"]
+    assert main([*command, str(tmp_path)]) == 0
     assert "parameters from raw measurements, with their covariance" in capsys.readouterr().out
 
 
@@ -444,8 +443,7 @@ def test_bad_files_are_refused_by_name(text, told, tmp_path):
 
 
 def test_an_unknown_bicycle_is_refused_with_the_nearest_one():
-    with pytest.raises(ValueError, match=r"no measurements of a bicycle `Browsr`.*`Browser`"):
-        benchmark_from_measurements("Browsr")
+    refused(r"no measurements of a bicycle `Browsr`.*`Browser`", benchmark_from_measurements, "Browsr")
 
 
 def test_several_readings_count_as_their_mean(tmp_path):
@@ -508,15 +506,10 @@ def test_result_and_table_say_what_the_limits_mean(studies, tmp_path):
 
 
 def test_the_command_writes_its_table_and_figures(tmp_path, capsys):
-    assert (
-        main(["bicycle", "Rigid", "Tms", "--samples", "60", "--out", str(tmp_path / "out")]) == 1
-    )  # one file was refused
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "result.json",
-        "eigenvalues.png",
-        "ride.png",
-        "ride.gif",
-    }
+    command = ["bicycle", "Rigid", "Tms", "--samples", "60", "--out"]
+    assert main([*command, str(tmp_path / "out")]) == 1  # one file was refused
+    written = ["eigenvalues.png", "result.json", "ride.gif", "ride.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == written
     assert "5.0084" in capsys.readouterr().out
 
 

@@ -15,34 +15,34 @@ from jourdain_jax.cli import main
 from jourdain_jax.models import MODELS
 
 
-def run(capsys, *arguments):
+def run(capsys, command, *arguments):
     """Exit code and standard output of one command."""
-    code = main(arguments)
+    code = main([*command.split(), *arguments])
     return code, capsys.readouterr()
 
 
 def test_models_lists_every_model_by_name(capsys):
-    code, out = run(capsys, "models", "--json")
+    code, out = run(capsys, "models --json")
     assert code == 0
     assert [row["name"] for row in json.loads(out.out)] == list(MODELS)
     assert run(capsys, "models")[1].out.count("\n") == len(MODELS)
 
 
 def test_models_tells_what_can_be_set_and_started_from(capsys):
-    code, out = run(capsys, "models", "tilting-disc")
+    code, out = run(capsys, "models tilting-disc")
     assert code == 0
     assert "mass=1 kg, radius=0.5 m, gravity=9.81 m/s^2" in out.out
     assert "yaw_rate, lean_rate, spin_rate" in out.out
     assert "lean=0.3, yaw_rate=0.5, lean_rate=0.2, spin_rate=-3; 10 s" in out.out
-    (row,) = json.loads(run(capsys, "models", "tilting-disc", "--json")[1].out)
+    (row,) = json.loads(run(capsys, "models tilting-disc --json")[1].out)
     assert row["example"] == dict(MODELS["tilting-disc"].example)
-    code, out = run(capsys, "models", "tilted-disc")
+    code, out = run(capsys, "models tilted-disc")
     assert code == 2
     assert "did you mean `tilting-disc`" in out.err
 
 
 def test_report_has_the_documented_keys(capsys):
-    code, out = run(capsys, "report", "chaplygin-sleigh", "--json")
+    code, out = run(capsys, "report chaplygin-sleigh --json")
     found = json.loads(out.out)
     assert code == 0
     assert found["degrees_of_freedom"] == 2
@@ -56,7 +56,7 @@ def test_report_has_the_documented_keys(capsys):
 
 
 def test_verify_has_the_documented_keys_and_passes(capsys):
-    code, out = run(capsys, "verify", "chaplygin-sleigh", "--json")
+    code, out = run(capsys, "verify chaplygin-sleigh --json")
     found = json.loads(out.out)
     assert code == 0
     assert found["passed"] is True
@@ -66,30 +66,11 @@ def test_verify_has_the_documented_keys_and_passes(capsys):
 
 def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
     files = [str(tmp_path / name) for name in ("run.npz", "run.png", "run.gif")]
-    arguments = [
-        "--t1",
-        "1",
-        "--set",
-        "mass=2",
-        "--start",
-        "x_rate=1",
-        "heading_rate=0.5",
-        "--samples",
-        "5",
-        "--json",
-    ]
-    code, out = run(
-        capsys,
-        "simulate",
-        "chaplygin-sleigh",
-        *arguments,
-        "--out",
-        files[0],
-        "--plot",
-        files[1],
-        "--animate",
-        files[2],
+    command = (
+        "simulate chaplygin-sleigh --t1 1 --set mass=2 --start x_rate=1 heading_rate=0.5 --samples 5 --json"
     )
+    written = ["--out", files[0], "--plot", files[1], "--animate", files[2]]
+    code, out = run(capsys, command, *written)
     found = json.loads(out.out)
     assert code == 0
     assert found["result"] == 0
@@ -105,17 +86,8 @@ def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, t
         raise PermissionError(13, "Permission denied", str(tmp_path / "run.npz"))
 
     monkeypatch.setattr("jourdain_jax.cli.model_verbs.save", refuse)
-    code, out = run(
-        capsys,
-        "simulate",
-        "chaplygin-sleigh",
-        "--t1",
-        "0.1",
-        "--samples",
-        "2",
-        "--out",
-        str(tmp_path / "run.npz"),
-    )
+    command = "simulate chaplygin-sleigh --t1 0.1 --samples 2 --out"
+    code, out = run(capsys, command, str(tmp_path / "run.npz"))
     assert code == 2
     assert (
         f"cannot read or write `{tmp_path / 'run.npz'}`: Permission denied; check the path and its"
@@ -124,10 +96,10 @@ def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, t
 
 
 def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
-    code, out = run(capsys, "report", "pendulum-chain", "--set", "links=2", "mass=0.5", "--json")
+    code, out = run(capsys, "report pendulum-chain --set links=2 mass=0.5 --json")
     assert code == 0
     assert json.loads(out.out)["degrees_of_freedom"] == 2
-    rows = {row["name"]: row for row in json.loads(run(capsys, "models", "--json")[1].out)}
+    rows = {row["name"]: row for row in json.loads(run(capsys, "models --json")[1].out)}
     assert rows["pendulum-chain"]["counts"] == {"links": {"value": 5}}
     assert rows["trailer-chain"]["counts"] == {"trailers": {"value": 3}}
     assert rows["skate"]["counts"] == {}
@@ -139,7 +111,7 @@ def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
 
 
 def test_a_simulation_for_machines_has_all_that_the_printed_one_has(capsys):
-    code, out = run(capsys, "simulate", "tilting-disc", "--t1", "0.2", "--samples", "3", "--json")
+    code, out = run(capsys, "simulate tilting-disc --t1 0.2 --samples 3 --json")
     found = json.loads(out.out)
     assert code == 0
     contact = found["contacts"]["rim"]

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 import jax
 import numpy as np
 import pytest
+from refusals import refused
 from test_studies import assert_same
 
 import jourdain_jax as jj
@@ -48,14 +49,22 @@ def test_a_cluster_computes_what_one_process_computes(client, tmp_path):
 
 
 def test_what_is_no_cluster_is_refused(client, tmp_path, monkeypatch):
-    with pytest.raises(
-        ValueError, match=r"`client` is the text 'tcp://10.0.0.1', expected a `dask.distributed.Client`"
-    ):
-        run(tmp_path / "discs.zarr", client="tcp://10.0.0.1")
-    with pytest.raises(ValueError, match="`client` and `processes` are both given"):
-        run(tmp_path / "discs.zarr", client=client, processes=2)
-    with pytest.raises(ValueError, match="at the top level of a module"):
-        run(tmp_path / "discs.zarr", {"lean": lambda motion: motion.q_end[3]}, client=client)
+    refused(
+        r"`client` is the text 'tcp://10.0.0.1', expected a `dask.distributed.Client`",
+        run,
+        tmp_path / "discs.zarr",
+        client="tcp://10.0.0.1",
+    )
+    refused(
+        "`client` and `processes` are both given", run, tmp_path / "discs.zarr", client=client, processes=2
+    )
+    refused(
+        "at the top level of a module",
+        run,
+        tmp_path / "discs.zarr",
+        {"lean": lambda motion: motion.q_end[3]},
+        client=client,
+    )
     assert not (tmp_path / "discs.zarr").exists()
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"jourdain-jax\[cluster\]"):

@@ -13,7 +13,7 @@ import result_codes as results
 from generated_robots import BeadOnCurve, PlanarRobot, drawn
 from numpy.testing import assert_allclose
 from solved_states import over_states
-from tolerances import tolerance
+from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
@@ -204,8 +204,8 @@ def test_the_program_puts_states_where_dense_matrices_put_them(name):
         jnp.stack, program.projected(fixed, t, tuple(q), tuple(u), nothing, structure_of(scene).affine)
     )
     expected = jj.consistent(scene, t, q, u)
-    assert_allclose(found_q, expected.q, atol=tolerance("round_off"))
-    assert_allclose(found_u, expected.u, atol=tolerance("round_off") * (1 + np.max(np.abs(u))))
+    assert_allclose(found_q, expected.q, atol=ROUND_OFF)
+    assert_allclose(found_u, expected.u, atol=ROUND_OFF * (1 + np.max(np.abs(u))))
 
 
 def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
@@ -215,7 +215,7 @@ def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
     y = tuple(u[k] for k in program.independent)
     found, same = program.projected(program.fixed_values(scene), t, tuple(1.001 * q), y, jnp.zeros(0), True)
     ((first, _),) = scene.coordinates.quaternions
-    assert abs(jnp.linalg.norm(jnp.stack(found)[first : first + 4]) - 1) <= tolerance("round_off")
+    assert abs(jnp.linalg.norm(jnp.stack(found)[first : first + 4]) - 1) <= ROUND_OFF
     assert same == y
 
 

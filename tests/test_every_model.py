@@ -13,7 +13,7 @@ import machine_code
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from tolerances import tolerance
+from tolerances import ROUND_OFF, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
@@ -98,15 +98,15 @@ def _check_lowered(name, scenes, states, udot, size):
         probes = Probes(program.graph, named_values(scene, t, q, u, np.zeros((STATES, len(scene.inputs)))))
         ydot, qdot, z = probes(program.ydot).T, probes(program.qdot).T, probes(program.z).T
         rates = np.asarray(jax.vmap(lambda t, q, u, scene=scene: coordinate_rates(scene, t, q, u))(t, q, u))
-        assert np.max(
-            np.abs(ydot - dense[:, list(program.independent)]) / relative_to, initial=0.0
-        ) <= tolerance("round_off"), "accelerations"
+        assert (
+            np.max(np.abs(ydot - dense[:, list(program.independent)]) / relative_to, initial=0.0) <= ROUND_OFF
+        ), "accelerations"
         assert np.max(np.abs(z - u[:, list(program.dependent)]), initial=0.0) <= tolerance(
             "round_off"
         ) * np.max(np.abs(u)), "dependent speeds"
-        assert np.max(np.abs(qdot - rates), initial=0.0) <= tolerance("round_off") * (
-            1 + np.max(np.abs(rates))
-        ), "rates of coordinates"
+        assert np.max(np.abs(qdot - rates), initial=0.0) <= ROUND_OFF * (1 + np.max(np.abs(rates))), (
+            "rates of coordinates"
+        )
 
 
 class OfAMotion(NamedTuple):
@@ -184,7 +184,7 @@ def check_both_modes(found: OfAMotion):
     assert np.max(found.left) <= 1e-8 * size
     assert np.all(np.abs(found.forwards - found.differences) <= found.left)
     apart = abs(found.gradient @ found.direction - found.weights @ found.forwards)
-    assert apart <= tolerance("round_off") * np.abs(found.gradient) @ np.abs(found.direction)
+    assert apart <= ROUND_OFF * np.abs(found.gradient) @ np.abs(found.direction)
 
 
 @natively

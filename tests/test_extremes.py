@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from small_scenes import Oscillator
 from test_mean_gradients import Thrown
 
 import jourdain_jax as jj
+from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.studies import Integral, Largest, LargestMagnitude, Smallest
 
 TIMES = np.linspace(0.0, 2.0, 41)
@@ -90,10 +92,11 @@ def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
     assert Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion) == pytest.approx(
         landed, rel=1e-9
     )
-    with pytest.raises(
-        ValueError, match=r"the quantity of an output is .*, expected real numbers of shape \(11,\)"
-    ):
-        Integral(lambda motion: motion.t_end).of(motion)
+    refused(
+        r"the quantity of an output is .*, expected real numbers of shape \(11,\)",
+        Integral(lambda motion: motion.t_end).of,
+        motion,
+    )
 
 
 def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
@@ -114,5 +117,5 @@ def test_a_motion_that_runs_back_in_time_has_its_end_too():
     left = -1.0 / 3.0
     assert motion.t_end == pytest.approx(left, abs=1e-9)
     outputs = Smallest("z"), LargestMagnitude("z_rate"), Integral("z")
-    found = jax.jit(lambda motion: [output.of(motion) for output in outputs])(motion)
+    found = eval_numpy(lambda motion: [output.of(motion) for output in outputs])(motion)
     assert_allclose(found, [0.0, 3.0, 0.5 * left - 1.5 * left**3], rtol=1e-9, atol=1e-9)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from derivatives import with_value
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from result_codes import AMBIGUOUS, SUCCESS
 
 import jourdain_jax as jj
@@ -17,7 +18,16 @@ from jourdain_jax.bicycle import measured_bicycle, shipped_bicycles
 G = 9.81
 
 
-class Ball(jj.Scene):
+class Heavy(jj.Scene):
+    """What weighs and has no other load."""
+
+    g = G
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.g),)
+
+
+class Ball(Heavy):
     """A ball above a plane."""
 
     mass: float = jj.parameter(0.17, positive=True)
@@ -36,9 +46,6 @@ class Ball(jj.Scene):
                 orientation=jj.quaternion_to_matrix(q.attitude),
             )
         }
-
-    def loads(self, motion):
-        return (jj.gravity(motion, self.g),)
 
     def contacts(self, pose):
         return {
@@ -141,17 +148,15 @@ def test_bounces_and_rest():
 
     def tenth(numbers):
         bounce, height = numbers
-        return jj.simulate(
-            Ball(bounce=bounce), {"z": 0.0285 + height, "x_rate": 0.1}, t1=2.6, rtol=1e-10, atol=1e-10
-        ).phases.ts[9]
+        start = {"z": 0.0285 + height, "x_rate": 0.1}
+        motion = jj.simulate(Ball(bounce=bounce), start, ts=[2.5, 3.0], rtol=1e-10, atol=1e-10)
+        return motion.phases.ts[9], (motion.phases.ts[9], motion.phase("cloth"), motion["z"][-1])
 
-    numbers = jnp.array([0.7, 1.0])
-    slopes, time = with_value(jax.jacfwd, tenth)(numbers)
+    slopes, (time, phase, z) = jax.jit(jax.jacfwd(tenth, has_aux=True))(jnp.array([0.7, 1.0]))
     assert_allclose(time, 2.47360446364125, rtol=1e-12)
     assert_allclose(slopes, [8.53571984478680, 1.23680223182063], rtol=1e-10)
-    motion = jj.simulate(Ball(bounce=0.7), {"z": 1.0285}, ts=[2.5, 3.0], rtol=1e-10, atol=1e-10)
-    assert motion.phase("cloth").tolist() == [0, 1]
-    assert_allclose(motion["z"][-1], 0.0285, rtol=1e-14)
+    assert phase.tolist() == [0, 1]
+    assert_allclose(z, 0.0285, rtol=1e-14)
 
 
 def at_rest(motion):
@@ -165,21 +170,23 @@ def settled(bounce, **options):
     return jj.simulate(Ball(bounce=bounce), {"z": 1.0285, "x_rate": 0.1}, ts=[0.4, 3.0], **options)
 
 
-@pytest.mark.parametrize("options", [{}, {"backend": "xla"}])
-def test_bounces_end_at_the_limit_of_their_series(options):
-    motion = settled(0.7, **options)
-    assert_allclose(at_rest(motion), 2.55863396558581, rtol=1e-11)
-    for derivative in (jax.jacfwd, jax.grad) if not options else (jax.jacfwd,):
-        assert_allclose(
-            derivative(lambda e: at_rest(settled(e, **options)))(0.7), 10.0338586885718, rtol=1e-9
-        )
-    assert_allclose(motion.energies().balance, 0.17 * (G * 1.0285 + 0.1**2 / 2), rtol=1e-11)
+def test_bounces_end_at_the_limit_of_their_series_on_arrays():
+    at_limit = lambda e: at_rest(settled(e, backend="xla"))
+    slope, time = with_value(jax.jacfwd, at_limit)(0.7)
+    assert_allclose(time, 2.55863396558581, rtol=1e-11)
+    assert_allclose(slope, 10.0338586885718, rtol=1e-9)
 
 
 def test_bounces_by_lanes_end_at_the_limits_of_their_series():
-    e = jnp.array([0.0, 0.1, 0.3, 0.5, 0.6, 0.69, 0.2])
-    found = jax.vmap(lambda e: at_rest(settled(e)))(e)
-    assert_allclose(found, np.sqrt(2 / G) * (1 + e) / (1 - e), rtol=1e-10)
+    def found(e):
+        motion = settled(e)
+        return at_rest(motion), motion.energies().balance
+
+    e = jnp.array([0.7, 0.0, 0.1, 0.3, 0.5, 0.6, 0.69, 0.2])
+    times, balance = jax.vmap(found)(e)
+    assert_allclose(times, np.sqrt(2 / G) * (1 + e) / (1 - e), rtol=1e-10)
+    assert_allclose(times[0], 2.55863396558581, rtol=1e-11)
+    assert_allclose(balance, 0.17 * (G * 1.0285 + 0.1**2 / 2), rtol=1e-11)
 
 
 class Tilted(Ball):
@@ -221,34 +228,38 @@ def test_a_ball_bounces_down_a_slope_and_goes_on(friction):
     def found(bounce):
         scene = Tilted(bounce=bounce, friction=friction)
         motion = jj.simulate(scene, {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
-        return jnp.stack([motion["x"][-1], motion["x_rate"][-1], at_rest(motion)])
+        values = jnp.stack([motion["x"][-1], motion["x_rate"][-1], at_rest(motion)])
+        return values, (values, motion.phase("cloth")[-1])
 
     right = lambda bounce: by_hand(bounce, friction, 1.9)
     slopes, values = with_value(jax.jacfwd, right)(0.55)
     for derivative in (jax.jacfwd, jax.jacrev):
-        found_slopes, found_values = with_value(derivative, found)(0.55)
+        found_slopes, (found_values, phase) = jax.jit(derivative(found, has_aux=True))(0.55)
         assert_allclose(found_values, values, rtol=1e-10)
         assert_allclose(found_slopes, slopes, rtol=1e-9, atol=1e-12)
-    motion = jj.simulate(Tilted(bounce=0.55, friction=friction), {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
-    assert motion.phase("cloth")[-1] == (1 if friction > 0.1 else 2)
+        assert phase == (1 if friction > 0.1 else 2)
 
 
-class OnSphere(Ball):
-    """A ball on top of a fixed sphere."""
+class OnSphere(Heavy):
+    """A ball in a plane on top of a fixed sphere."""
+
+    friction: float = jj.parameter(0.5)
+    coordinates = jj.coordinates("x z turn")
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, 0.0, q.z], orientation=jj.rot_y(q.turn))}
 
     def contacts(self, pose):
-        ground = jj.Sphere(1 - self.radius, side="outside")
+        ground = jj.Sphere(0.9, side="outside")
         return {
-            "ground": jj.ball_contact(
-                pose["ball"], self.radius, ground=ground, height="row", friction=self.friction
-            )
+            "ground": jj.ball_contact(pose["ball"], 0.1, ground=ground, height="row", friction=self.friction)
         }
 
 
 def test_a_ball_slips_and_lifts_off_a_sphere():
     def phases(friction):
-        start = {"z": 1.0, "x_rate": 0.1, "attitude_omega_y": 1.0}
-        found = jj.simulate(OnSphere(mass=1.0, radius=0.1, friction=friction), start, t1=1.6, **FINE).phases
+        start = {"z": 1.0, "x_rate": 0.1, "turn_rate": 1.0}
+        found = jj.simulate(OnSphere(friction=friction), start, t1=1.6, **FINE).phases
         return found.ts, (found.ts, found.modes)
 
     slopes, (ts, modes) = jax.jit(jax.jacfwd(phases, has_aux=True))(0.5)
@@ -301,7 +312,9 @@ def test_impacts_along_the_impulse(law, rates, gained):
         scene, {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}, ts=[1e-9, 1e-2], **FINE
     )
     assert_allclose(motion.u[0], rates, rtol=1e-7)
-    assert_allclose(motion.energies().kinetic - 1.3488015753419331, gained, rtol=1e-10)
+    a, b, first, second = (motion[name] for name in ("a", "b", "a_rate", "b_rate"))
+    kinetic = 2 / 3 * first**2 + second**2 / 6 + first * second * np.cos(a - b) / 2
+    assert_allclose(kinetic - 1.3488015753419331, gained, rtol=1e-10)
 
 
 def test_an_impact_that_would_gain_energy_has_a_code():
@@ -356,7 +369,7 @@ def test_impacts_where_slip_turns_have_a_code_along_the_impulse():
     assert "slip reverses during an impact" in motion.message
 
 
-class Rod(jj.Scene):
+class Rod(Heavy):
     """A rod in a plane, whose lower end touches the floor."""
 
     friction: float = jj.parameter(1.0)
@@ -364,9 +377,6 @@ class Rod(jj.Scene):
 
     def bodies(self, t, q):
         return {"rod": jj.RigidBody(1.0, (0.0, 1 / 12, 1 / 12), [q.x, 0.0, q.z], jj.rot_y(-q.a))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         return {
@@ -390,7 +400,7 @@ def test_coulombs_law_has_no_answer_for_a_rod():
         assert (motion.result == 0) == right
 
 
-class Hoop(jj.Scene):
+class Hoop(Heavy):
     """A hoop in a plane with a heavy bead on its rim."""
 
     coordinates = jj.coordinates("x z turn")
@@ -399,9 +409,6 @@ class Hoop(jj.Scene):
         turn, centre = jj.rot_y(q.turn), jnp.stack([q.x, 0.0 * q.x, q.z])
         hoop = jj.RigidBody(0.2, 0.2 * jnp.diag(jnp.array([0.5, 1.0, 0.5])), centre, turn)
         return {"hoop": hoop, "bead": jj.Particle(1.0, centre + turn @ jnp.array([0.0, 0.0, 1.0]))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["hoop"], 1.0, height="row", friction=0.6)}
@@ -415,7 +422,7 @@ def test_a_hoop_slips_and_rolls_again():
     assert_allclose([motion["turn"][0], motion["x"][1]], [1.888898912431, 2.607814697168], rtol=1e-11)
 
 
-class Coin(jj.Scene):
+class Coin(Heavy):
     """A coin above a table."""
 
     friction: float = jj.parameter(0.3)
@@ -425,9 +432,6 @@ class Coin(jj.Scene):
     def bodies(self, t, q):
         moments = 0.01 * 0.012**2 * np.array([0.25, 0.5, 0.25])
         return {"coin": jj.RigidBody(0.01, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         return {
@@ -529,38 +533,41 @@ class Kept(Ball):
 
 
 def test_bad_contacts():
-    with pytest.raises(
-        ValueError,
-        match="cannot leave the ground; give the body a coordinate for its height, and write height=",
-    ):
-        Kept()
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative"
-        ),
-    ):
-        jj.simulate(Ball(friction=-0.1), SLIDING, t1=0.1)
-    with pytest.raises(
-        ValueError,
-        match=r"the restitution of contact `cloth` of `Ball` is 1\.2, expected a number from 0 to 1",
-    ):
-        jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
-    with pytest.raises(
-        ValueError,
-        match=r"contacts with friction, which cannot run backward in time from t0 = 0\.0 to t1 = -1\.0 s",
-    ):
-        jj.simulate(Ball(), SLIDING, t1=-1.0)
-    with pytest.raises(
-        ValueError, match=("`family` supports only contacts that never slip, but `cloth` of `Ball` may slip")
-    ):
-        jj.family(Ball(), {"z": 0.0285})
-    with pytest.raises(
-        ValueError, match=r"contacts with friction of `Tilted` \(cloth\) must fly, roll or slip"
-    ):
-        jj.linearize(Tilted(friction=0.01, slope=0.5), {"z": 0.0285})
-    with pytest.raises(ValueError, match=r"of `Sled` \(blade, heading_rate\) must fly, roll or slip in a"):
-        jj.steady(Sled(), {})
+    refused("cannot leave the ground; give the body a coordinate for its height, and write height=", Kept)
+    refused(
+        r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative",
+        jj.simulate,
+        Ball(friction=-0.1),
+        SLIDING,
+        t1=0.1,
+    )
+    refused(
+        r"the restitution of contact `cloth` of `Ball` is 1\.2, expected a number from 0 to 1",
+        jj.simulate,
+        Ball(bounce=1.2),
+        SLIDING,
+        t1=0.1,
+    )
+    refused(
+        r"contacts with friction, which cannot run backward in time from t0 = 0\.0 to t1 = -1\.0 s",
+        jj.simulate,
+        Ball(),
+        SLIDING,
+        t1=-1.0,
+    )
+    refused(
+        "`family` supports only contacts that never slip, but `cloth` of `Ball` may slip",
+        jj.family,
+        Ball(),
+        {"z": 0.0285},
+    )
+    refused(
+        r"contacts with friction of `Tilted` \(cloth\) must fly, roll or slip",
+        jj.linearize,
+        Tilted(friction=0.01, slope=0.5),
+        {"z": 0.0285},
+    )
+    refused(r"of `Sled` \(blade, heading_rate\) must fly, roll or slip in a", jj.steady, Sled(), {})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body starts below the ground" in below.message
 
@@ -586,7 +593,7 @@ def test_a_start_in_contact():
         assert_allclose(motion["x_rate"][1], along * 0.3, rtol=1e-8)
 
 
-class Cart(jj.Scene):
+class Cart(Heavy):
     """A block on two runners, in a plane."""
 
     bounce: float = jj.parameter(0.0)
@@ -595,9 +602,6 @@ class Cart(jj.Scene):
 
     def bodies(self, t, q):
         return {"cart": jj.RigidBody(10.0, jnp.ones(3), [q.x, 0.0, q.z], jj.rot_y(q.pitch))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         def runner(x):
@@ -678,14 +682,14 @@ def test_a_block_sticks_and_slips_on_a_belt():
     slope, value = with_value(jax.jacfwd, period)(0.4)
     assert_allclose(value, 1.360846391399, rtol=1e-10)
     assert_allclose(slope, 4.14018082448, rtol=1e-7)
-    with pytest.raises(
-        ValueError,
-        match=(
-            r"static friction of contact `belt` of `Belt` is 0\.2, expected at least the coefficient of"
-            r" sliding, 0\.25"
-        ),
-    ):
-        jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)
+    refused(
+        r"static friction of contact `belt` of `Belt` is 0\.2, expected at least the coefficient of"
+        r" sliding, 0\.25",
+        jj.simulate,
+        Belt(0.2),
+        {"z": 0.1},
+        t1=0.1,
+    )
 
 
 def test_a_block_slips_at_rest_on_its_belt():
@@ -705,7 +709,7 @@ def test_a_block_slips_at_rest_on_its_belt():
     assert from_rest.phase("belt")[0] == 2
 
 
-class Kerb(jj.Scene):
+class Kerb(Heavy):
     """A ball that rolls in a plane against an edge 0.02 m above its floor."""
 
     coordinates = jj.coordinates("x z turn")
@@ -713,9 +717,6 @@ class Kerb(jj.Scene):
 
     def bodies(self, t, q):
         return {"ball": jj.RigidBody(1.0, 0.4 * 0.01 * jnp.eye(3), [q.x, 0.0, q.z], jj.rot_y(q.turn))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         edge = jj.Cylinder(1e-7, axis=(0.0, 1.0, 0.0), origin=(0.0, 0.0, 0.02), side="outside")
@@ -966,14 +967,15 @@ class Sled(jj.Scene):
 def test_dense_matrices_begin_with_the_trace_that_lowering_has_read():
     """Both start from one trace of the scene, which lowering must not change. XLA would take 40 s."""
     start = {"x_rate": 2.0, "heading_rate": 1.0}
-    by_backend = lambda backend: jj.simulate(Sled(), start, ts=[1.5], backend=backend, **FINE)
-    by_program = by_backend("native")
-    by_matrices = jax.eval_shape(lambda: by_backend("dense"))
+    by_program, by_matrices = (
+        jax.eval_shape(lambda way=way: jj.simulate(Sled(), start, ts=[1.5], backend=way, **FINE))
+        for way in ("native", "dense")
+    )
     assert by_matrices.q.shape == by_program.q.shape
     assert by_matrices.phases.modes.shape == by_program.phases.modes.shape
 
 
-class Braking(jj.Scene):
+class Braking(Heavy):
     """A bicycle in its plane: the rear wheel turns, all else is one body, since the front wheel is locked."""
 
     mass: float = jj.parameter(16.0, positive=True)  # of this body; x, z: its centre, from the rear contact
@@ -998,9 +1000,6 @@ class Braking(jj.Scene):
             "frame": self.placed(q, self.mass, self.inertia, self.x, self.z, q.pitch),
             "wheel": self.placed(q, self.wheel, self.turning, 0.0, self.rear, q.turn),
         }
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
     def contacts(self, pose):
         law = {"height": "row", "friction": self.friction}

@@ -72,7 +72,7 @@ def test_the_rows_of_both_steered_wheels_of_a_car_agree_to_round_off():
     car = scene_of("car_with_trailers")
     start = jj.start(car, x_rate=3.0, steer=0.35, steer_rate=0.2, heading=0.4)
     A = constraint_rows(car, 0.0, start.q, start.u).A
-    singular = np.linalg.svd(np.asarray(A), compute_uv=False)
+    singular = np.linalg.svd(A, compute_uv=False)
     assert A.shape[0] == car.trailers + 3
     assert singular[-1] < 1e-15 < 0.1 < singular[-2]
 

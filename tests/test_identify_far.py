@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
@@ -87,8 +88,14 @@ def test_a_minimum_that_one_guess_alone_leads_to_is_warned_of():
 
 @pytest.mark.parametrize("guesses", [0, -3, True])
 def test_a_number_of_guesses_that_is_none_is_refused(guesses):
-    with pytest.raises(ValueError, match=r"`guesses` is .*, expected a whole number of at least 1"):
-        jj.fit(Oscillator(), data(0), FREE, guesses=guesses)
+    refused(
+        r"`guesses` is .*, expected a whole number of at least 1",
+        jj.fit,
+        Oscillator(),
+        data(0),
+        FREE,
+        guesses=guesses,
+    )
 
 
 class Resting(OnLine):

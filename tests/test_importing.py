@@ -29,8 +29,8 @@ assert dict(os.environ) == before | {
 jax.config.update("jax_num_cpu_devices", 3)  # an error where JAX has computed anything
 assert jax.device_count() == 3
 
-disc = jj.models.TiltingDisc()
-assert jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), t1=0.1).result == 0
+disc = jj.models.VerticalDisc()
+assert jj.simulate(disc, jj.start(disc, roll_rate=-3.0), t1=0.1).result == 0
 jj.clear_caches()  # of what is imported
 left = {
     "diffrax",
@@ -69,8 +69,8 @@ assert found.items() <= os.environ.items()
 assert jj.configure() == found  # what is set stays
 
 from jourdain_jax.kernels.host import threads
-disc = jj.models.TiltingDisc()
-assert jj.simulate(disc, jj.start(disc, lean=0.3), t1=0.1).result == 0 and threads() == 3
+disc = jj.models.VerticalDisc()
+assert jj.simulate(disc, jj.start(disc, roll_rate=-3.0), t1=0.1).result == 0 and threads() == 3
 try:
     jj.configure()
 except RuntimeError as error:

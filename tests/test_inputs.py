@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from scipy.integrate import solve_ivp
 from small_scenes import OnLine, OnPlane
 
@@ -53,10 +54,15 @@ def test_a_start_meets_rows_that_depend_on_inputs_at_its_time(speed):
 def test_given_values_are_compared_with_the_rows_at_the_inputs():
     kept = jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 3.0})
     assert (kept["x_rate"], kept["y"]) == (4.5, 0.5)
-    with pytest.raises(ValueError, match=r"violates constraint `belt`: residual 1.5 remains"):
-        jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 2.0})
-    with pytest.raises(ValueError, match=r"violates constraint `belt`: residual 4.5 remains"):
-        jj.start(OnBelt(), y=0.5, x_rate=4.5)
+    refused(
+        r"violates constraint `belt`: residual 1.5 remains",
+        jj.start,
+        OnBelt(),
+        y=0.5,
+        x_rate=4.5,
+        inputs={"speed": 2.0},
+    )
+    refused(r"violates constraint `belt`: residual 4.5 remains", jj.start, OnBelt(), y=0.5, x_rate=4.5)
 
 
 def test_a_start_follows_its_inputs_smoothly_and_in_batches():
@@ -95,8 +101,7 @@ def test_a_start_refuses_inputs_in_the_words_of_simulate(inputs):
 
 
 def test_a_scene_without_inputs_takes_none_in_a_start():
-    with pytest.raises(ValueError, match="`ChaplyginSleigh` has no input `force`"):
-        jj.start(ChaplyginSleigh(), inputs={"force": 1.0})
+    refused("`ChaplyginSleigh` has no input `force`", jj.start, ChaplyginSleigh(), inputs={"force": 1.0})
 
 
 # Potentials that depend on inputs. --------------------------------------------------------------------------
@@ -259,11 +264,14 @@ JUMPS = {
 @pytest.mark.parametrize("way", JUMPS)
 def test_an_input_of_a_row_that_jumps_is_refused(way):
     for motions, rates in ((jj.simulate, 1.0), (jj.rollout, np.array([1.0, 2.0]))):
-        with pytest.raises(
-            ValueError,
-            match=r"input `speed` of `Towed` jumps at t = .* s, but velocity constraints depend on it",
-        ):
-            motions(Towed(), {"x_rate": rates}, t1=2.0, inputs={"speed": JUMPS[way]})
+        refused(
+            r"input `speed` of `Towed` jumps at t = .* s, but velocity constraints depend on it",
+            motions,
+            Towed(),
+            {"x_rate": rates},
+            t1=2.0,
+            inputs={"speed": JUMPS[way]},
+        )
 
 
 def test_an_input_of_a_row_may_bend_and_be_steep():
@@ -281,8 +289,14 @@ def test_an_input_of_a_row_that_has_no_derivative_is_refused():
     def measured(t):
         return jax.pure_callback(lambda t: np.asarray(t) ** 2, jax.ShapeDtypeStruct((), t.dtype), t)
 
-    with pytest.raises(ValueError, match="constraints depend on inputs and need their rates"):
-        jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": measured})
+    refused(
+        "constraints depend on inputs and need their rates",
+        jj.simulate,
+        Towed(),
+        {"x_rate": 1.0},
+        t1=2.0,
+        inputs={"speed": measured},
+    )
 
 
 # Inputs given by samples: steps end at their knots, so that no feature is passed over, however short it is

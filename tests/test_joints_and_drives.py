@@ -4,7 +4,7 @@ terms.
 
 import jax.numpy as jnp
 import numpy as np
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, DRIFT, RESIDUAL, relative_error
 
 import jourdain_jax as jj
 
@@ -61,7 +61,7 @@ def test_a_pinned_rod_is_the_pendulum_in_its_angle_and_the_pin_carries_newtons_f
     pinned = jj.simulate(free, {"angle": 0.9, "angle_rate": 0.4}, ts=ts, **TIGHT)
     swinging = jj.simulate(angle, {"angle": 0.9, "angle_rate": 0.4}, ts=ts, **TIGHT)
     pinned.raise_if_failed(), swinging.raise_if_failed()
-    assert relative_error(pinned["angle"], swinging["angle"]) <= tolerance("closed_form")
+    assert relative_error(pinned["angle"], swinging["angle"]) <= CLOSED_FORM
     # m a = F_pin - m g e_z with the centre at l/2: a in polar form
     phi, rate = swinging["angle"], swinging["angle_rate"]
     acceleration = -1.5 * GRAVITY / 0.8 * jnp.sin(phi)  # I_end = m l^2/3
@@ -72,7 +72,7 @@ def test_a_pinned_rod_is_the_pendulum_in_its_angle_and_the_pin_carries_newtons_f
     found = sum(
         reactions.force[:, s, 0] for s, row in enumerate(reactions.row_names) if row.startswith("hinge")
     )
-    assert relative_error(found[:, [0, 2]], expected) <= tolerance("closed_form")
+    assert relative_error(found[:, [0, 2]], expected) <= CLOSED_FORM
     assert np.all(reactions.determined)
 
 
@@ -123,8 +123,8 @@ def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
     motion = jj.simulate(scene, start, t1=3.0, ts=jnp.linspace(0.0, 3.0, 4), **TIGHT)
     motion.raise_if_failed()
     positions, velocities = motion.residuals()
-    assert np.max(np.abs(positions)) <= tolerance("residual")
-    assert np.max(np.abs(velocities)) <= tolerance("residual")
+    assert np.max(np.abs(positions)) <= RESIDUAL
+    assert np.max(np.abs(velocities)) <= RESIDUAL
     moving = motion.motions()
     momentum = sum(body.mass[:, None] * body.velocity for body in moving.bodies.values())
     spin = sum(
@@ -134,8 +134,8 @@ def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
         )
         for body in moving.bodies.values()
     )
-    assert relative_error(momentum, jnp.broadcast_to(momentum[0], momentum.shape), 1.0) <= tolerance("drift")
-    assert relative_error(spin, jnp.broadcast_to(spin[0], spin.shape)) <= tolerance("drift")
+    assert relative_error(momentum, jnp.broadcast_to(momentum[0], momentum.shape), 1.0) <= DRIFT
+    assert relative_error(spin, jnp.broadcast_to(spin[0], spin.shape)) <= DRIFT
 
 
 class Driven(jj.Scene):
@@ -166,12 +166,12 @@ def test_a_driven_coordinate_needs_the_force_of_the_closed_form_and_does_its_wor
     # m x'' = -k (x - a sin W t), x(0) = x'(0) = 0
     b = a * w**2 / (w**2 - W**2)
     x = b * (jnp.sin(W * ts) - W / w * jnp.sin(w * ts))
-    assert relative_error(motion["place"], x) <= tolerance("closed_form")
+    assert relative_error(motion["place"], x) <= CLOSED_FORM
     drive = a * jnp.sin(W * ts)
     force = -0.5 * W**2 * drive + 18.0 * (drive - x)  # of the actuator: m_end end'' = F + k (x - end)
-    assert relative_error(motion.constraint_forces().multipliers[:, 0], force) <= tolerance("closed_form")
+    assert relative_error(motion.constraint_forces().multipliers[:, 0], force) <= CLOSED_FORM
     balance = motion.energies().balance  # T + V less the work of the actuator
-    assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), 0.1) <= tolerance("drift")
+    assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), 0.1) <= DRIFT
 
 
 def test_baumgartes_terms_pull_a_start_off_the_constraints_back_as_their_own_oscillator():

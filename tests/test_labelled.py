@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import refused
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -21,14 +22,9 @@ def motion():
 
 @pytest.fixture(scope="module")
 def lanes():
-    chain = jj.models.TrailerChain(trailers=1)
-    return jj.rollout(
-        chain,
-        {**chain.towing([0.0, 0.0]), "forward0": np.linspace(0.5, 2.0, 3)},
-        parameters={"car_mass": np.array([1.0, 2.0, 3.0])},
-        ts=TIMES,
-        progress=False,
-    )
+    starts = {"x_rate": np.linspace(0.5, 2.0, 3), "heading_rate": 0.7}
+    masses = {"mass": np.array([1.0, 2.0, 3.0])}
+    return jj.rollout(jj.models.Skate(), starts, parameters=masses, ts=TIMES, progress=False)
 
 
 def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):
@@ -48,13 +44,13 @@ def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):
 
 def test_a_rollout_has_an_axis_of_lanes_with_their_codes_and_parameters(lanes):
     data = lanes.to_xarray()
-    assert data.x0.dims == ("lane", "time")
-    assert_array_equal(data.x0, lanes["x0"])
+    assert data.x.dims == ("lane", "time")
+    assert_array_equal(data.x, lanes["x"])
     assert_array_equal(data.result, lanes.result)
-    assert_array_equal(data.car_mass, [1.0, 2.0, 3.0])
+    assert_array_equal(data.mass, [1.0, 2.0, 3.0])
     assert_array_equal(data.steps, lanes.lanes.accepted)
     one = data.sel(lane=1).sel(time=0.2, method="nearest")
-    assert float(one.forward0) == float(lanes.lane(1)["forward0"][2])
+    assert float(one.x_rate) == float(lanes.lane(1)["x_rate"][2])
 
 
 def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
@@ -63,7 +59,7 @@ def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
     assert_array_equal(table["x"], motion["x"])
     many = lanes.to_pandas()
     assert many.index.names == ["lane", "time"]
-    assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
+    assert_array_equal(many.loc[2]["y"], lanes.lane(2)["y"])
 
 
 class _Named(OnLine):
@@ -80,8 +76,7 @@ class _Timed(jj.Scene):
 @pytest.mark.parametrize(("scene", "name"), [(_Timed(), "time"), (_Named(), "steps")])
 def test_a_name_of_two_arrays_is_refused(scene, name):
     """The coordinate would take the place of the axis, the parameter would be left out."""
-    with pytest.raises(ValueError, match=f"`{name}` would name two arrays of the dataset"):
-        jj.simulate(scene, {}, ts=TIMES).to_xarray()
+    refused(f"`{name}` would name two arrays of the dataset", jj.simulate(scene, {}, ts=TIMES).to_xarray)
 
 
 @pytest.mark.parametrize(("package", "ask"), [("xarray", "to_xarray"), ("pandas", "to_pandas")])
@@ -92,10 +87,11 @@ def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, p
 
 
 def test_wrong_names_and_traced_motions_are_refused(motion):
-    with pytest.raises(
-        ValueError, match="`units` names `xx`, which is not a coordinate or speed of `TiltingDiscQuaternion`"
-    ):
-        motion.to_xarray(units={"xx": "m"})
+    refused(
+        "`units` names `xx`, which is not a coordinate or speed of `TiltingDiscQuaternion`",
+        motion.to_xarray,
+        units={"xx": "m"},
+    )
     with pytest.raises(TypeError, match="`to_xarray` was called inside jit"):
         jax.jit(lambda m: m.to_xarray() or 0)(motion)
 
@@ -140,10 +136,8 @@ def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
 def test_a_rollout_shows_medians_and_bands_of_its_coordinates_in_a_notebook(lanes, drawn):
     shown = lanes._repr_html_()
     names = lanes.lanes.scene.coordinate_names.entries
-    assert shown.startswith("<pre>Rollout of TrailerChain: 3 lanes")
+    assert shown.startswith("<pre>Rollout of Skate: 3 lanes")
     assert len(drawn[0].axes) == len(names)
     assert [(len(axes.lines), len(axes.collections)) for axes in drawn[0].axes] == [(1, 2)] * len(names)
-    low, high = (
-        float(x) for x in (lanes.quantiles("x0", [0.025]).min(), lanes.quantiles("x0", [0.975]).max())
-    )
-    assert f"x0: {low:.3g} to {high:.3g}" in [axes.get_title() for axes in drawn[0].axes]
+    low, high = (float(x) for x in (lanes.quantiles("x", [0.025]).min(), lanes.quantiles("x", [0.975]).max()))
+    assert f"x: {low:.3g} to {high:.3g}" in [axes.get_title() for axes in drawn[0].axes]

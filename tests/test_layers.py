@@ -72,12 +72,18 @@ def _modules(root, package):
     }
 
 
+def _statements(node, inside=False):
+    """All statements in a node, and whether they stand in a function."""
+    yield node, inside
+    inside |= isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(node, block, ()):
+            yield from _statements(inner, inside)
+
+
 def _imports(module, path, known) -> Iterator[Import]:
-    tree = ast.parse(path.read_text())
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    inside = {inner for node in functions for inner in ast.walk(node)}
     above = [*module.split("."), *(["__init__"] if path.name == "__init__.py" else [])]
-    for node in ast.walk(tree):
+    for node, inside in _statements(ast.parse(path.read_text())):
         if isinstance(node, ast.Import | ast.ImportFrom):
             level, named = getattr(node, "level", 0), getattr(node, "module", None)
             base = ".".join([*above[: -level if level else 0], *([named] if named else [])])
@@ -89,7 +95,7 @@ def _imports(module, path, known) -> Iterator[Import]:
                     if f"{base}.{name}" in known
                     else base
                 )
-                yield Import(target, node.lineno, node in inside, name == "*")
+                yield Import(target, node.lineno, inside, name == "*")
 
 
 def _rank(module, package) -> int | None:

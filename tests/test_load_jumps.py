@@ -59,8 +59,8 @@ KINKS = {
 }
 
 
-def end(push, start=0.4, **options):
-    """Where the particle ends, as a function of its speed along x."""
+def end(push, start=0.4, see=lambda motion: motion.q_end[1], **options):
+    """Where the particle ends, or what else is seen, as a function of its speed along x."""
 
     def of(speed, size=0.4):
         motion = jj.simulate(
@@ -70,7 +70,7 @@ def end(push, start=0.4, **options):
             work=False,
             **options,
         )
-        return motion.q_end[1]
+        return see(motion)
 
     return of
 
@@ -90,12 +90,20 @@ def warned(f, *arguments):
 def test_a_derivative_across_a_jump_warns_where_no_step_ends_there():
     f = end(JUMPS["at a place"])
     assert not warned(jax.grad(f), -1.0)
-    dense = end(JUMPS["at a place"], backend="dense")
-    for slope in (jax.grad(dense), jax.jacfwd(dense)):
-        (said,) = warned(slope, -1.0)
+
+    def see(motion):
+        assert "the scene has no scalar program" in motion.unwatched
+        return motion.q_end[1], motion.crossings
+
+    dense = end(JUMPS["at a place"], see=see, backend="dense")
+    for derivative in (jax.grad, jax.jacfwd):
+        found = []
+        slope = derivative(dense, has_aux=True)
+        (said,) = warned(lambda speed, slope=slope, found=found: found.extend(slope(speed)), -1.0)
+        assert found[1] == -1  # dense matrices do not watch relations
         assert "`Pushed`" in said
         assert "omit the shift of the jump's time" in said
-    assert len(warned(jax.grad(dense), -0.1)) == 1  # whether the jump is met is not seen
+    assert len(warned(slope, -0.1)) == 1  # whether the jump is met is not seen
 
 
 class UntilThere(Pushed):
@@ -118,11 +126,11 @@ def test_a_motion_that_ends_at_the_jump_and_another_after_it_have_the_right_deri
     with warnings.catch_warnings():
         warnings.simplefilter("error", jj.SensitivityWarning)
         value, slope = jax.value_and_grad(in_two)(0.5)
-    assert float(value) == pytest.approx(0.08 + 0.4 * 0.6 + 0.36, abs=1e-6)
-    assert float(slope) == pytest.approx(0.2 * 0.6 / 0.25, abs=1e-6)
+    assert value == pytest.approx(0.08 + 0.4 * 0.6 + 0.36, abs=1e-6)
+    assert slope == pytest.approx(0.2 * 0.6 / 0.25, abs=1e-6)
     value_in_one, slope_in_one = jax.value_and_grad(end(JUMPS["at a place"]))(-0.5)
-    assert float(value_in_one) == pytest.approx(float(value) + 0.1, abs=1e-6)  # with 0.1 m/s along y
-    assert float(slope_in_one) == pytest.approx(-float(slope), abs=1e-6)
+    assert value_in_one == pytest.approx(float(value) + 0.1, abs=1e-6)  # with 0.1 m/s along y
+    assert slope_in_one == pytest.approx(-float(slope), abs=1e-6)
 
 
 def test_values_kinks_and_times_that_no_parameter_moves_do_not_warn():
@@ -265,7 +273,7 @@ def test_a_magnitude_goes_on_past_its_switch(name):
     push, expected = ONE_SIGN[name]
     motion = jj.simulate(Pushed(push=push), {"x_rate": 3.0}, ts=[4.0], rtol=1e-9, atol=1e-9)
     assert motion.succeeded
-    assert float(motion["y_rate"][-1]) == pytest.approx(expected, abs=2e-3)
+    assert motion["y_rate"][-1] == pytest.approx(expected, abs=2e-3)
 
 
 def test_a_magnitude_is_written_as_text():

@@ -48,6 +48,11 @@ def tolerance(name, dtype=np.float64):
     return table[name]
 
 
+CLOSED_FORM, DRIFT, ILL_CONDITIONED, LINEARIZATION, RESIDUAL, ROUND_OFF = map(
+    tolerance, ("closed_form", "drift", "ill_conditioned", "linearization", "residual", "round_off")
+)
+
+
 def relative_error(value, expected, size: float | None = None):
     """Largest |value - expected| divided by `size` (default: the largest |expected|, or 1 where that is
     zero).
