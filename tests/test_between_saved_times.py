@@ -84,14 +84,7 @@ def test_rows_stated_twice_hide_no_singular_partition():
 
 def _parallelograms(count, **options):
     w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
-    starts = {
-        "a": np.full(count, a_0),
-        "b": np.zeros(count),
-        "c": np.full(count, a_0),
-        "a_rate": w,
-        "b_rate": 0 * w,
-        "c_rate": w,
-    }
+    starts = {"a": a_0, "b": 0.0, "c": a_0, "a_rate": w, "b_rate": 0.0, "c_rate": w}
     found = jj.rollout(Parallelogram(), starts, ts=ts, **options)
     error = np.max(
         np.abs(np.asarray(found.lanes.q) - (a_0 + w[:, None] * ts)[..., None] * [1, 0, 1]), axis=(1, 2)
@@ -117,12 +110,7 @@ def test_steps_of_constant_length_that_lose_their_rows_are_flagged():
 def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_flagged(options):
     count = 64 if not options else 8
     w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
-    starts = {
-        "a": np.full(count, 0.5),
-        "b": np.full(count, -0.5),
-        "x": np.full(count, 2 * np.cos(0.5)),
-        "a_rate": w,
-    }
+    starts = {"a": 0.5, "b": -0.5, "x": 2 * np.cos(0.5), "a_rate": w}
     found = jj.rollout(SliderCrank(), starts, ts=ts, formulation=jj.Formulation("full"), **options)
     arrived = found.result == results.SUCCESS
     assert np.mean(arrived) > 0.6

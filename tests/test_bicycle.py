@@ -39,18 +39,9 @@ from jourdain_jax.cli.bicycle_verbs import prefixes
 # Measured bicycle files: what ships is read or refused as intended, and every refusal says what to do.
 
 
-SHIPPED = [
-    "Balanceassistv1",
-    "Benchmark",
-    "Browser",
-    "Browserins",
-    "Crescendo",
-    "Fisher",
-    "Pista",
-    "Rigid",
-    "Silver",
-]
-SHIPPED += ["Tms", "Yellow", "Yellowrev"]
+SHIPPED = """
+Balanceassistv1 Benchmark Browser Browserins Crescendo Fisher Pista Rigid Silver Tms Yellow Yellowrev
+"""
 GOOD = shipped_bicycles()["Browser"].read_text()
 
 
@@ -72,10 +63,10 @@ def _refusal(path):
 
 
 def test_twelve_bicycles_ship():
-    assert sorted(shipped_bicycles()) == SHIPPED
+    assert sorted(shipped_bicycles()) == SHIPPED.split()
 
 
-@pytest.mark.parametrize("name", [name for name in SHIPPED if name != "Tms"])
+@pytest.mark.parametrize("name", [name for name in SHIPPED.split() if name != "Tms"])
 def test_a_shipped_bicycle_is_read(name):
     bicycle = shipped(name)
     assert bicycle.name == name

@@ -21,10 +21,15 @@ def run(capsys, command, *arguments):
     return code, capsys.readouterr()
 
 
-def test_models_lists_every_model_by_name(capsys):
-    code, out = run(capsys, "models --json")
+def answer(capsys, command, *arguments):
+    """What a command says in JSON."""
+    code, out = run(capsys, command, *arguments)
     assert code == 0
-    assert [row["name"] for row in json.loads(out.out)] == list(MODELS)
+    return json.loads(out.out)
+
+
+def test_models_lists_every_model_by_name(capsys):
+    assert [row["name"] for row in answer(capsys, "models --json")] == list(MODELS)
     assert run(capsys, "models")[1].out.count("\n") == len(MODELS)
 
 
@@ -34,7 +39,7 @@ def test_models_tells_what_can_be_set_and_started_from(capsys):
     assert "mass=1 kg, radius=0.5 m, gravity=9.81 m/s^2" in out.out
     assert "yaw_rate, lean_rate, spin_rate" in out.out
     assert "lean=0.3, yaw_rate=0.5, lean_rate=0.2, spin_rate=-3; 10 s" in out.out
-    (row,) = json.loads(run(capsys, "models tilting-disc --json")[1].out)
+    (row,) = answer(capsys, "models tilting-disc --json")
     assert row["example"] == dict(MODELS["tilting-disc"].example)
     code, out = run(capsys, "models tilted-disc")
     assert code == 2
@@ -42,9 +47,7 @@ def test_models_tells_what_can_be_set_and_started_from(capsys):
 
 
 def test_report_has_the_documented_keys(capsys):
-    code, out = run(capsys, "report chaplygin-sleigh --json")
-    found = json.loads(out.out)
-    assert code == 0
+    found = answer(capsys, "report chaplygin-sleigh --json")
     assert found["degrees_of_freedom"] == 2
     assert found["rank"] == 1
     assert found["nonholonomic_rows"] == ["blade"]
@@ -56,9 +59,7 @@ def test_report_has_the_documented_keys(capsys):
 
 
 def test_verify_has_the_documented_keys_and_passes(capsys):
-    code, out = run(capsys, "verify chaplygin-sleigh --json")
-    found = json.loads(out.out)
-    assert code == 0
+    found = answer(capsys, "verify chaplygin-sleigh --json")
     assert found["passed"] is True
     assert max(found[key] for key in ("max_disagreement", "virtual_power", "energy_balance")) < 1e-12
     assert found["gradient_error"] < 1e-8
@@ -70,9 +71,7 @@ def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
         "simulate chaplygin-sleigh --t1 1 --set mass=2 --start x_rate=1 heading_rate=0.5 --samples 5 --json"
     )
     written = ["--out", files[0], "--plot", files[1], "--animate", files[2]]
-    code, out = run(capsys, command, *written)
-    found = json.loads(out.out)
-    assert code == 0
+    found = answer(capsys, command, *written)
     assert found["result"] == 0
     assert found["t_end"] == 1.0
     loaded = jj.load_trajectory(files[0], MODELS["chaplygin-sleigh"])
@@ -96,10 +95,9 @@ def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, t
 
 
 def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
-    code, out = run(capsys, "report pendulum-chain --set links=2 mass=0.5 --json")
-    assert code == 0
-    assert json.loads(out.out)["degrees_of_freedom"] == 2
-    rows = {row["name"]: row for row in json.loads(run(capsys, "models --json")[1].out)}
+    found = answer(capsys, "report pendulum-chain --set links=2 mass=0.5 --json")
+    assert found["degrees_of_freedom"] == 2
+    rows = {row["name"]: row for row in answer(capsys, "models --json")}
     assert rows["pendulum-chain"]["counts"] == {"links": {"value": 5}}
     assert rows["trailer-chain"]["counts"] == {"trailers": {"value": 3}}
     assert rows["skate"]["counts"] == {}
@@ -111,9 +109,7 @@ def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
 
 
 def test_a_simulation_for_machines_has_all_that_the_printed_one_has(capsys):
-    code, out = run(capsys, "simulate tilting-disc --t1 0.2 --samples 3 --json")
-    found = json.loads(out.out)
-    assert code == 0
+    found = answer(capsys, "simulate tilting-disc --t1 0.2 --samples 3 --json")
     contact = found["contacts"]["rim"]
     assert 0 < contact["lowest_normal"] <= contact["highest_normal"]
     assert contact["friction_needed"] > 0

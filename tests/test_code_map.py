@@ -27,8 +27,8 @@ CEILINGS = {
     "ways: values and derivatives of constraints, for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
-    "code tokens of tests": 331_204,
-    "code tokens of bench": 99_807,
+    "code tokens of tests": 328_467,
+    "code tokens of bench": 99_791,
     "test files that reach private names": 34,
 }
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles import whipple_bicycle
 from refusals import refused
 from rolling_scenes import GRAVITY, GROUNDS, BallInBowl, BallInDrum, Rolls, RouthSphere, TyredBicycle
 from tolerances import DRIFT, ILL_CONDITIONED, ROUND_OFF
@@ -228,22 +229,11 @@ def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
 def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
     # a tyre adds r N lean^2/2 of its wheel to the potential: K0 + N_R r_R (1, 0)(1, 0)' + N_F r_F (1, sin
     # lam)(1, sin lam)'
-    M = np.array([[80.81722, 2.319413322087091], [2.319413322087091, 0.2978418819968556]])
-    C1 = np.array([[0, 33.86641391492494], [-0.8503564145697844, 1.6854039739755967]])
-    K0 = 9.81 * np.array([[-80.95, -2.5995168524987164], [-2.5995168524987164, -0.8032948845861769]])
-    K2 = np.array([[0, 76.5973458957322], [0, 2.654315237946040]])
-    rear_load, front_load, v = 612.836470588236, 309.303529411765, 5.0
+    loads, v, across = whipple_bicycle.WHEEL_LOADS, 5.0, np.array([1.0, np.sin(np.pi / 10)])
     for rear, front in ((0.0, 0.0), (0.03, 0.02), (0.1, 0.06)):
-        across = np.array([1.0, np.sin(np.pi / 10)])
-        K = (
-            K0
-            + v**2 * K2
-            + rear_load * rear * np.diag([1.0, 0.0])
-            + front_load * front * np.outer(across, across)
-        )
-        expected = np.linalg.eigvals(
-            np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, v * C1)]])
-        )
+        K0 = whipple_bicycle.K0 + loads["rear"] * rear / 9.81 * np.diag([1.0, 0.0])
+        K0 += loads["front"] * front / 9.81 * np.outer(across, across)
+        expected = np.linalg.eigvals(whipple_bicycle.state_matrix(v, k0=K0))
         bicycle = TyredBicycle(rear_tyre=rear, front_tyre=front)
         found = np.asarray(
             jj.linearize(bicycle, bicycle.upright(v), coordinates=("lean", "steer")).eigenvalues()

@@ -119,9 +119,8 @@ def test_neighbours_in_lanes_are_right(kind):
         "atol": 1e-8,
         "progress": False,
     }
-    starts = {"x": np.zeros(200), "x_rate": 1.0}
-    found = jj.rollout(KINDS[kind], starts, **options)
-    exact = jj.rollout(KINDS[kind], starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
+    found = jj.rollout(KINDS[kind], START, **options)
+    exact = jj.rollout(KINDS[kind], START, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
     assert not exact.failed.size
     wrong = np.abs(found.lanes.q_end - exact.lanes.q_end)[:, 0] > 1e-5
     assert not np.any(wrong)

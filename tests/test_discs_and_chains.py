@@ -32,7 +32,8 @@ from jourdain_jax.models import (
 
 
 RUN = rolling_disc.RUN
-TILTING = TiltingDisc(RUN["mass"], RUN["radius"], RUN["gravity"])
+SIZES = [RUN[name] for name in ("mass", "radius", "gravity")]
+TILTING = TiltingDisc(*SIZES)
 START = {name: RUN[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
 
 
@@ -140,7 +141,7 @@ def test_the_tilting_disc_wobbles_along_its_reference_path():
 
 
 def test_the_free_disc_wobbles_along_the_same_path():
-    scene = TiltingDiscQuaternion(RUN["mass"], RUN["radius"], RUN["gravity"])
+    scene = TiltingDiscQuaternion(*SIZES)
     start = _free_body(
         0.0, RUN["lean"], 0.0, RUN["yaw_rate"], RUN["lean_rate"], RUN["spin_rate"], RUN["radius"]
     )

@@ -299,24 +299,13 @@ def first_crossing(x_rate, z_rate, floor, wall, roof, slope):
 
 
 def generated_throws(count=48):
-    random = np.random.default_rng(13)
-    throws = [
-        (
-            random.uniform(2, 6),
-            random.uniform(-2, 3),
-            random.uniform(-1, 0.9),
-            random.uniform(0.3, 3),
-            random.uniform(1.05, 3),
-            random.uniform(1.3, 6),
-        )
-        for _ in range(count)
+    low, high = [2, -2, -1, 0.3, 1.05, 1.3], [6, 3, 0.9, 3, 3, 6]
+    # the last ones: one shortly after the other, in every order
+    close = [
+        (4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2)
+        for floor, wall, slope in itertools.permutations([0.20, 0.21, 0.22])
     ]
-    # one shortly after the other, in every order
-    for floor, wall, slope in itertools.permutations([0.20, 0.21, 0.22]):
-        throws.append(
-            (4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2)
-        )
-    return np.array(throws)
+    return np.vstack([np.random.default_rng(13).uniform(low, high, (count, 6)), close])
 
 
 @pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
@@ -328,12 +317,7 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
             # at the end of a step
             100.0
         )
-    starts = {
-        "x": np.zeros(len(throws)),
-        "z": np.ones(len(throws)),
-        "x_rate": throws[:, 0],
-        "z_rate": throws[:, 1],
-    }
+    starts = {"x": 0.0, "z": 1.0, "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
     walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
     lanes = jj.rollout(
         Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, **options
@@ -342,7 +326,7 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     assert_array_equal(lanes.event, [event for event, _ in expected])
     assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
     assert set(np.asarray(lanes.event)) >= {0, 1, 3}
-    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    assert_array_equal(lanes.result, results.EVENT)
     assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
 
 
@@ -399,8 +383,8 @@ def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there()
     own = {
         name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))
     }
-    lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0]).lanes
-    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    lanes = jj.rollout(Bounded(), {"x_rate": 1.3}, parameters=own, ts=[5.0]).lanes
+    assert_array_equal(lanes.result, results.EVENT)
     assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
     assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
     assert_allclose(lanes.t_end, edges / 1.3, rtol=1e-13)
@@ -425,11 +409,11 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
     """A stone thrown up against a roof that it passes by little: a step would take it there and back."""
     passes, longest = np.array([1e-4, 1e-2, 0.3]), 2.5
     top = 1.0 + 5.0**2 / (2 * GRAVITY)
-    starts = {"z": np.ones(3), "z_rate": np.full(3, 5.0)}
+    starts = {"z": 1.0, "z_rate": 5.0}
     scene = Thrown(floor=-100.0, wall=100.0, slope=100.0)
     lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], max_step=np.inf).lanes
     expected = 5.0 / GRAVITY - np.sqrt(2 * passes / GRAVITY)
-    assert_array_equal(lanes.event, np.full(3, 2))
+    assert_array_equal(lanes.event, 2)
     assert_allclose(lanes.t_end, expected, rtol=1e-9)
 
 

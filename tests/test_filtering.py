@@ -31,16 +31,9 @@ def kalman(damping, stiffness, noise, run, spread, mass=2.0):
         block = scipy.linalg.expm(np.block([[-A, W], [np.zeros((2, 2)), A.T]]) * (t1 - t))
         F = block[2:, 2:].T
         x, P, t = F @ x, F @ P @ F.T + F @ block[:2, 2:], t1
-        rows = [
-            (np.array([1.0, 0.0]), run["x"][k], 0.02),
-            (2.0 * np.array([0.0, 1.0]), run["speedometer"][k] - 0.1, 0.05),
-        ]
-        rows = [row for row in rows if np.isfinite(row[1])]
-        H, z, R = (
-            np.array([r[0] for r in rows]),
-            np.array([r[1] for r in rows]),
-            np.diag([r[2] ** 2 for r in rows]),
-        )
+        z = np.array([run["x"][k], run["speedometer"][k] - 0.1])
+        seen = np.isfinite(z)
+        H, z, R = np.diag([1.0, 2.0])[seen], z[seen], np.diag([0.02**2, 0.05**2])[np.ix_(seen, seen)]
         S = H @ P @ H.T + R
         K = P @ H.T @ np.linalg.inv(S)
         r = z - H @ x

@@ -34,6 +34,10 @@ def measured(seed, start=START, ts=TS) -> jj.Experiment:
     return jj.Experiment(ts, values, {"x": 0.01, "heading": None}, start=start)
 
 
+def offset_of(data):
+    return jj.fit(TRUTH, data, ("offset",))
+
+
 @pytest.fixture(scope="module")
 def fitted():
     data = measured(0)
@@ -49,8 +53,8 @@ def test_a_fit_comes_back_from_a_pickle_with_all_that_it_tells(fitted):
 
 def test_measurements_that_count_twice_are_named(fitted):
     _, data = fitted
-    assert not jj.fit(TRUTH, data, free=("offset",)).warnings
-    twice = jj.fit(TRUTH, [data, data], free=("offset",))
+    assert not offset_of(data).warnings
+    twice = offset_of([data, data])
     assert "`x` of run 0 and `x` of run 1 hold equal numbers" in str(twice.warnings)
     both = jj.Experiment(
         data.ts,
@@ -59,9 +63,7 @@ def test_measurements_that_count_twice_are_named(fitted):
         start=data.start,
         sensors={"odometer": "x"},
     )
-    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith(
-        "`odometer` of run 0 and `x` of run 0 hold equal numbers"
-    )
+    assert offset_of(both).warning.startswith("`odometer` of run 0 and `x` of run 0 hold equal numbers")
 
 
 def page(path) -> ElementTree.Element:
@@ -116,17 +118,21 @@ def test_report_holds_the_numbers_of_the_fit(fitted, written):
     (fit, data), (path, _, _) = fitted, written
     found = sections(path)
     assert page(path).find(".//pre").text == str(fit)
-    assert found["Correlations"]["offset"][1] == pytest.approx(float(fit.correlation[0, 1]), abs=0.0051)
+    assert float(found["Correlations"]["offset"][1]) == pytest.approx(
+        float(fit.correlation[0, 1]), abs=0.0051
+    )
     value = np.asarray(data.values["heading"])
     error = np.asarray(jj.simulate(fit.scene, START, ts=TS)["heading"]) - value
     (told,) = (line for line in found["Data (dots) and prediction (line)"] if "`heading`" in line)
     samples, rms, r_squared = re.search(r": (\d+) samples .* rms of (\S+); R\^2 (\S+)", told).groups()
     assert samples == "41"
-    assert r_squared == pytest.approx(1 - np.sum(error**2) / np.sum((value - value.mean()) ** 2), abs=2e-6)
-    assert rms == pytest.approx(np.sqrt(np.mean(error**2)), rel=5e-3)
+    assert float(r_squared) == pytest.approx(
+        1 - np.sum(error**2) / np.sum((value - value.mean()) ** 2), abs=2e-6
+    )
+    assert float(rms) == pytest.approx(np.sqrt(np.mean(error**2)), rel=5e-3)
     for name, (rho, _) in fit.autocorrelation.items():
         cells = found["Are the residuals white?"][name]
-        assert cells[0] == pytest.approx(rho, abs=6e-4)
+        assert float(cells[0]) == pytest.approx(rho, abs=6e-4)
         assert cells[2] == "yes"
 
 
@@ -167,7 +173,9 @@ def test_runs_held_out_are_predicted(fitted, written):
     for name, line in zip(("heading", "x"), lines, strict=True):
         error = np.asarray(motion[name]) - np.asarray(other.values[name])
         assert line.startswith(f"`{name}` of held out, run 0")
-        assert re.search(r"rms of (\S+);", line)[1] == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=6e-3)
+        assert float(re.search(r"rms of (\S+);", line)[1]) == pytest.approx(
+            np.sqrt(np.nanmean(error**2)), rel=6e-3
+        )
 
 
 def test_a_report_without_matplotlib_has_all_words_and_says_what_to_install(fitted, tmp_path, monkeypatch):
@@ -226,13 +234,13 @@ def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
     for k in range(1, 41):
         e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.9**2) * e[k]
     data = jj.Experiment(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
-    fit = jj.fit(TRUTH, data, free=("offset",))
+    fit = offset_of(data)
     fit.report(tmp_path / "fit.html", data)
     _, _, white, time, narrow = sections(tmp_path / "fit.html")["Are the residuals white?"]["heading"]
     rho = fit.autocorrelation["heading"][0]
     assert white == "NO"
-    assert time.split()[1] == pytest.approx(-0.1 / np.log(rho), rel=0.06)
-    assert narrow.split()[1] == pytest.approx(np.sqrt((1 + rho) / (1 - rho)), rel=0.06)
+    assert float(time.split()[1]) == pytest.approx(-0.1 / np.log(rho), rel=0.06)
+    assert float(narrow.split()[1]) == pytest.approx(np.sqrt((1 + rho) / (1 - rho)), rel=0.06)
     assert "intervals from the sigmas are too narrow" in (tmp_path / "fit.html").read_text(encoding="utf-8")
 
 
@@ -340,7 +348,7 @@ def test_what_does_not_show_has_a_flat_profile():
 
 
 def test_profiles_answer_wrong_names_and_other_data():
-    fit = jj.fit(TRUTH, data := run(), ("offset",))
+    fit = offset_of(data := run())
     with pytest.raises(KeyError, match="`ofset` was not estimated; did you mean `offset`"):
         fit.profiles(data, "ofset")
     refused("are not the data of the fit", fit.profiles, run(noise=9))
@@ -394,7 +402,7 @@ def test_a_share_is_by_how_much_the_variance_falls_with_the_weight_of_the_sample
 
 def test_a_prior_takes_what_the_data_do_not_tell():
     data = run(noise=None)
-    alone = jj.fit(TRUTH, data, ("offset",))
+    alone = offset_of(data)
     s = 2 * float(alone["offset"].standard_error)
     fit = jj.fit(TRUTH, data, {"offset": jj.Estimate(prior=Normal(0.25, s))})
     found = shares(fit, data)
@@ -402,7 +410,7 @@ def test_a_prior_takes_what_the_data_do_not_tell():
 
 
 def test_the_span_that_holds_half_of_the_information_is_the_shortest_one():
-    fit = jj.fit(TRUTH, data := run(), ("offset",))
+    fit = offset_of(data := run())
     found = shares(fit, data)
     told = sum(of[0] for of in found.of_samples[0].values())
     _, begin, end = found.half(0)
@@ -461,7 +469,7 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
 
 
 def test_runs_held_out_that_cannot_be_predicted_are_answered():
-    fit = jj.fit(TRUTH, run(unknown=()), ("offset",))
+    fit = offset_of(run(unknown=()))
     scaled = jj.Experiment(
         TS,
         {"gyro": np.zeros(41)},

@@ -21,10 +21,8 @@ G = 9.81
 class Heavy(jj.Scene):
     """What weighs and has no other load."""
 
-    g = G
-
     def loads(self, motion):
-        return (jj.gravity(motion, self.g),)
+        return (jj.gravity(motion, getattr(self, "g", G)),)
 
 
 class Ball(Heavy):

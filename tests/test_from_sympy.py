@@ -131,10 +131,15 @@ def errors(kane, scene, values, count=3, inputs=None):
     return max(found)
 
 
+def made(system):
+    """A system, values of its constants, and its scene."""
+    kane, origin, values = system()
+    return kane, values, jj.from_sympy(kane, origin, values)()
+
+
 @pytest.mark.parametrize("name", systems.SYSTEMS)
 def test_accelerations_are_those_of_sympys_own_equations(name):
-    kane, origin, values = systems.SYSTEMS[name]()
-    scene = jj.from_sympy(kane, origin, values)()
+    kane, values, scene = made(systems.SYSTEMS[name])
     assert scene.speed_names.entries == tuple(str(u.func) for u in kane.u)
     assert scene.coordinate_names.entries[: len(kane.q)] == tuple(str(q.func) for q in kane.q)
     assert errors(kane, scene, values) < CLOSED_FORM
@@ -155,8 +160,7 @@ def test_constants_are_parameters_that_can_be_replaced_and_differentiated():
 
 
 def test_a_function_of_time_that_is_no_coordinate_is_an_input():
-    kane, origin, values = systems.pendulum()
-    scene = jj.from_sympy(kane, origin, values)()
+    *_, scene = made(systems.pendulum)
     assert scene.inputs.entries == ("torque",)
     without, with_torque = (
         jj.accelerations(scene, 0.0, [0.4], [0.3], {"torque": x}).udot[0] for x in (0.0, 0.5)
@@ -165,8 +169,7 @@ def test_a_function_of_time_that_is_no_coordinate_is_an_input():
 
 
 def test_a_contact_point_without_coordinates_gets_a_path():
-    kane, origin, values = systems.rolling_disc()
-    scene = jj.from_sympy(kane, origin, values)()
+    *_, scene = made(systems.rolling_disc)
     assert scene.coordinate_names.entries[3:] == ("C_x", "C_y")
     motion = jj.motion_at(scene, 0.0, [0.0, 0.0, 0.0, 0.2, 0.1], [0.0, 3.0, 0.0])  # upright, rolling along x
     assert_allclose(motion["disc"].velocity, [1.2, 0.0, 0.0], atol=1e-12)
@@ -189,8 +192,7 @@ def test_a_wheel_without_an_angle_gets_one():
 
 
 def test_velocities_that_agree_where_rows_are_met_need_no_coordinates():
-    kane, origin, values = systems.sleigh()
-    assert jj.from_sympy(kane, origin, values)().coordinate_names.entries == ("x", "y", "heading")
+    assert made(systems.sleigh)[-1].coordinate_names.entries == ("x", "y", "heading")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of SymPy 1.13
@@ -219,8 +221,7 @@ def test_joints_of_sympy_become_a_scene_when_their_equations_are_formed():
 
 
 def test_velocity_rows_that_repeat_geometric_ones_are_left_out():
-    kane, origin, values = systems.four_bar()
-    scene = jj.from_sympy(kane, origin, values)()
+    *_, scene = made(systems.four_bar)
     t, q, u = (x[0] for x in jj.sample_states(scene, 1))
     assert constraint_rows(scene, t, q, u).names == ("configuration 1", "configuration 2")
 
@@ -236,42 +237,12 @@ def test_functions_of_many_kinds_have_values_on_jax():
     from jourdain_jax.importers.formulas import Formulas
 
     x, y = sympy.symbols("x y")
-    one = [
-        sympy.sin(x),
-        sympy.cos(x),
-        sympy.tan(x),
-        sympy.asin(x),
-        sympy.acos(x),
-        sympy.atan(x),
-        sympy.sinh(x),
-        sympy.cosh(x),
-        sympy.tanh(x),
-    ]
-    one += [
-        sympy.asinh(x),
-        sympy.acosh(1 + x),
-        sympy.atanh(x),
-        sympy.exp(x),
-        sympy.log(x),
-        sympy.sqrt(x),
-        1 / sympy.sqrt(x),
-        x**-3,
-        x**y,
-        sympy.Abs(-x * y),
-    ]
-    one += [
-        sympy.atan2(y, x),
-        sympy.sign(-x),
-        sympy.Heaviside(x),
-        sympy.Min(x, y),
-        sympy.Max(x, y),
-        sympy.floor(7 * y),
-        sympy.ceiling(7 * y),
-        sympy.erf(x),
-    ]
+    names = "sin cos tan asin acos atan sinh cosh tanh asinh atanh exp log sqrt Heaviside erf sinc"
+    one = [getattr(sympy, name)(x) for name in names.split()]
+    one += [sympy.acosh(1 + x), 1 / sympy.sqrt(x), x**-3, x**y, sympy.Abs(-x * y), sympy.atan2(y, x)]
+    one += [sympy.sign(-x), sympy.Min(x, y), sympy.Max(x, y), sympy.floor(7 * y), sympy.ceiling(7 * y)]
     one += [
         sympy.Piecewise((x, x > y), (y**2, sympy.Or(y > 5, sympy.Ne(x, y))), (0, True)),
-        sympy.sinc(x),
         sympy.pi * x + sympy.E,
         sympy.Rational(1, 3) * y,
     ]

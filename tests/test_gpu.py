@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
+from numpy.testing import assert_array_equal
 from small_scenes import OnPlane
 from test_modes import NUMBERS, seen
 
@@ -53,9 +54,7 @@ def _check(name: str, kinds, orders, **options) -> set[str]:
     for order, memory in orders:
         with gpu_twin.in_place_of_a_gpu(order, memory) as made:
             for kind, found in _numbers(name, kinds, **options).items():
-                np.testing.assert_array_equal(
-                    found, expected[kind], err_msg=f"{name}, {kind}, threads {order}"
-                )
+                assert_array_equal(found, expected[kind], err_msg=f"{name}, {kind}, threads {order}")
         texts.update(made)
     return texts
 
@@ -107,7 +106,7 @@ def test_events_after_which_a_motion_goes_on(kind):
     expected = made()
     for order, memory in (("in order", 2**40), ("at once", FEW)):
         with gpu_twin.in_place_of_a_gpu(order, memory):
-            np.testing.assert_array_equal(made(), expected)
+            assert_array_equal(made(), expected)
 
 
 # What happens where the driver refuses.
@@ -198,7 +197,7 @@ def test_samples_that_lanes_share_are_given_once():
         for (of, varied, tables), right in zip(cases, expected, strict=True):
             program = jax.jit(jax.vmap(of))
             assert f"(tensor<{tables}xf64>, " in program.lower(varied).as_text()
-            np.testing.assert_array_equal(program(varied), right)
+            assert_array_equal(program(varied), right)
 
 
 def test_no_lanes_are_no_call_that_fails():
@@ -230,7 +229,7 @@ def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
             ):
                 jax.block_until_ready(run(speeds))
             assert not any("@step_back(" in text for text in launched)
-            np.testing.assert_array_equal(run(speeds), expected)  # all goes on
+            assert_array_equal(run(speeds), expected)  # all goes on
 
 
 def test_a_kernel_that_this_process_has_not_loaded_is_an_error():
@@ -320,7 +319,7 @@ def test_samples_drawn_on_a_device_have_the_bits_of_the_host(sampler):
     found = design._at(np.arange(7, count), on_device=True)
     for name, column in design.values(7, count).items():
         assert isinstance(found[name], jax.Array)
-        np.testing.assert_array_equal(found[name], column)
+        assert_array_equal(found[name], column)
 
 
 def test_many_lanes_run_at_once_on_a_gpu():
@@ -351,8 +350,8 @@ with gpu_twin.in_place_of_a_gpu() as launched:
     assert (
         len(found[0].devices()) == 2 and second[0].devices() == {jax.devices()[1]} and 3 in launched.values()
     )
-np.testing.assert_array_equal(found, expected)
-np.testing.assert_array_equal(second, expected)
+assert_array_equal(found, expected)
+assert_array_equal(second, expected)
 """
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import with_value
+from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.integrate import solve_ivp
 
@@ -50,7 +51,7 @@ def test_an_oscillator_that_rubs_stops_where_the_spring_no_longer_moves_it(deriv
     assert swings == 6
     assert end(0.5, 0.9) == pytest.approx(x, abs=1e-11)
     slopes = jax.jit(derivative(lambda p: end(p[0], p[1])))(np.array([0.5, 0.9]))
-    np.testing.assert_allclose(slopes, [(-1.0) ** swings, -((-1.0) ** swings) * 2 * swings / 20.0], atol=1e-9)
+    assert_allclose(slopes, [(-1.0) ** swings, -((-1.0) ** swings) * 2 * swings / 20.0], atol=1e-9)
 
 
 def test_a_batch_of_oscillators_stops_after_different_numbers_of_swings():
@@ -59,7 +60,7 @@ def test_a_batch_of_oscillators_stops_after_different_numbers_of_swings():
         Oscillator(), {"x": np.full(12, 0.5)}, parameters={"friction": forces}, ts=[12.0], **TIGHT
     )
     assert len({rest(0.5, force)[1] for force in forces}) > 5
-    np.testing.assert_allclose(motions["x"][:, 0], [rest(0.5, force)[0] for force in forces], atol=1e-10)
+    assert_allclose(motions["x"][:, 0], [rest(0.5, force)[0] for force in forces], atol=1e-10)
 
 
 def test_arrays_of_jax_have_the_same_motion():
@@ -90,8 +91,8 @@ def test_a_joint_at_rest_may_hold_with_more_than_it_slips_with(derivative):
         return ((static - 0.5) * t**2 / 2 + t**3 / 3) / 0.7
 
     slopes, places = with_value(derivative, x)(1.1)
-    np.testing.assert_allclose(places, [0.0, closed(1.1)], atol=1e-12)
-    np.testing.assert_allclose(slopes, [0.0, jax.jit(jax.grad(closed))(1.1)], atol=1e-10)
+    assert_allclose(places, [0.0, closed(1.1)], atol=1e-12)
+    assert_allclose(slopes, [0.0, jax.jit(jax.grad(closed))(1.1)], atol=1e-10)
 
 
 class Sled(jj.Scene):
@@ -128,7 +129,7 @@ def test_a_blade_slips_where_a_turn_needs_more_than_it_holds(derivative):
     found = with_value(derivative, place)(3.0)
     right = with_value(jax.jacfwd, lambda holds: closed_sled(holds, 2.5))(3.0)
     for one, exact, error in zip(found, right, (1e-8, 1e-10), strict=True):
-        np.testing.assert_allclose(one, exact, atol=error)
+        assert_allclose(one, exact, atol=error)
     motion = jj.simulate(Sled(), {"x_rate": 1.5, "yaw_rate": 2.0}, t0=0.0, ts=[1.0, 2.5])
     assert motion.phase("blade").tolist() == [2, 1]
     assert "blade: holds" in str(motion.phases)
@@ -158,7 +159,7 @@ def test_a_braked_wheel_locks_and_skids_or_rolls_to_rest(brake, locks):
     start = {"z": 0.3, "x_rate": 3.0, "spin_rate": 10.0}
     motion = jj.simulate(Braked(brake=brake), start, t0=0.0, ts=[0.05, 0.6, 6.0], **TIGHT)
     slowing = 0.5 * 9.81 if locks else brake / 0.3 / (1.5 * 4.0)  # mu g, or torque/r over 3 m/2
-    np.testing.assert_allclose(motion["x"][2], 3.0**2 / (2 * slowing), rtol=1e-9)
+    assert_allclose(motion["x"][2], 3.0**2 / (2 * slowing), rtol=1e-9)
     assert motion.phase("x").tolist() == ([2, 2, 1] if locks else [1, 1, 1])
     assert motion.phase("spin_rate").tolist() == ([2, 1, 1] if locks else [2, 2, 1])
 
@@ -232,7 +233,7 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
         changes += 1
     motion = jj.simulate(Chain(), {"first": 1.2, "second": -0.9}, ts=[3.0], **TIGHT)
     assert changes >= 4
-    np.testing.assert_allclose([motion["first"][0], motion["second"][0]], y[:2], atol=1e-8)
+    assert_allclose([motion["first"][0], motion["second"][0]], y[:2], atol=1e-8)
 
 
 def test_what_cannot_hold_is_refused():

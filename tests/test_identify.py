@@ -121,10 +121,10 @@ CART = Cart()
 TS = np.linspace(0.0, 4.0, 21)
 
 
-def cart_motion(ts, x0, v0, push):
+def cart_motion(ts, x0, v0, push, mass=2.0):
     """x and v of the cart under a push that is constant in time, in closed form."""
-    rest, rate = push / 5.0, 0.6 / 4.0
-    w = np.sqrt(5.0 / 2.0 - rate**2)
+    rest, rate = push / 5.0, 0.3 / mass
+    w = np.sqrt(5.0 / mass - rate**2)
     a, b = x0 - rest, (v0 + rate * (x0 - rest)) / w
     decay = np.exp(-rate * ts)
     x = rest + decay * (a * np.cos(w * ts) + b * np.sin(w * ts))
@@ -142,6 +142,11 @@ def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Experiment:
     }
     given |= {"inputs": {"push": sampled}} | options
     return Experiment(ts, given.pop("values"), given.pop("sigma"), **given)
+
+
+def mass_of(runs, guess=1.7, **options):
+    """A fit of the mass alone."""
+    return fit(Cart(mass=guess), runs, ("mass",), **options)
 
 
 def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
@@ -184,13 +189,11 @@ def test_samples_that_are_missing_do_not_count(missing):
     some, x = np.arange(21) % 2 == 0, cart_run().values["x"]
     wrong = np.where(some, x, np.nan if missing == "no number" else 99.0)
     sigma = np.where(some, 0.01, np.inf) if missing == "of no weight" else 0.01
-    found = fit(
-        Cart(mass=1.7),
+    found = mass_of(
         cart_run(
             values={"x": np.ma.masked_where(~some, wrong) if missing == "masked" else wrong},
             sigma={"x": sigma},
-        ),
-        ("mass",),
+        )
     )
     assert found.samples == found.residual_summary()[0].samples == 11
     assert found["mass"].value == pytest.approx(2.0, rel=1e-6)
@@ -281,7 +284,7 @@ def test_a_parameter_that_must_be_above_zero_ends_a_little_above_it():
 
 
 def test_a_motion_that_fails_gives_a_flag_and_no_numbers():
-    found = fit(Cart(mass=1.7), cart_run(), ("mass",), max_steps=2)
+    found = mass_of(cart_run(), max_steps=2)
     assert not found.converged
     assert "the motion fails at the first guess" in found.warning
     assert "NOT CONVERGED" in str(found)
@@ -289,28 +292,23 @@ def test_a_motion_that_fails_gives_a_flag_and_no_numbers():
 
 
 def test_too_few_iterations_and_wrong_sigmas_are_warned_of():
-    found = fit(Cart(mass=0.2), cart_run(), ("mass",), max_iterations=1)
+    found = mass_of(cart_run(), 0.2, max_iterations=1)
     assert not found.converged
     assert "no minimum was found" in found.warning
     data = cart_run()
     shaken = {name: values + 0.1 * np.sin(5.0 * TS) for name, values in data.values.items()}
-    assert (
-        "residuals are larger than the sigmas allow"
-        in fit(Cart(mass=1.7), cart_run(values=shaken), ("mass",)).warning
-    )
+    assert "residuals are larger than the sigmas allow" in mass_of(cart_run(values=shaken)).warning
 
 
 def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     values = noisy(0, sigma=(0.01, 0.01)).values
-    assert not fit(Cart(mass=1.7), cart_run(values=values, sigma=0.01), ("mass",)).warnings
-    (warning,) = fit(
-        Cart(mass=1.7), cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)
-    ).warnings
+    assert not mass_of(cart_run(values=values, sigma=0.01)).warnings
+    (warning,) = mass_of(cart_run(values=values, sigma={"x": 0.01, "x_rate": 0.07})).warnings
     assert (
         "the residuals of `x_rate` are smaller than the sigmas predict by a factor of about 7.9: sigmas are"
         " too large" in warning
     )
-    (warning,) = fit(Cart(mass=1.7), cart_run(values=values, sigma=0.1), ("mass",), loss=huber()).warnings
+    (warning,) = mass_of(cart_run(values=values, sigma=0.1), loss=huber()).warnings
     assert "the residuals are smaller than the sigmas predict" in warning
 
 
@@ -325,7 +323,7 @@ def test_measurements_without_noise_are_told_in_one_sentence(guess):
 
 def test_sigmas_are_not_called_too_large_where_residuals_have_a_memory():
     run = noisy(5, sigma=(0.004, 0.004), memory=0.9)
-    (warning,) = fit(Cart(mass=1.7), cart_run(values=run.values, sigma=0.01), ("mass",)).warnings
+    (warning,) = mass_of(cart_run(values=run.values, sigma=0.01)).warnings
     assert "are not white" in warning
 
 
@@ -394,7 +392,7 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
         UserWarning,
         match="`push` of run 1 does not cover the whole run and keeps its last value from 1 to 4 s",
     ) as seen:
-        found = fit(Cart(mass=1.7), [cart_run(), cart_run(inputs=ends)], ("mass",))
+        found = mass_of([cart_run(), cart_run(inputs=ends)])
     assert len(seen) == 1
     assert sum("from 1 to 4 s" in warning for warning in found.warnings) == 1
     with pytest.warns(UserWarning, match="`push` of run 0 .* keeps its first value until 1.6 s"):
@@ -443,10 +441,10 @@ def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_chan
             sensors={"cart": lambda motion: scale * motion["cart"].position},
         )
 
-    first = fit(Cart(mass=1.5), [run(0.3), run(-0.5)], ("mass",))
+    first = mass_of([run(0.3), run(-0.5)], 1.5)
     compilations.clear()
     for options in ({"cutoff": 1e-5}, {"tolerance": 1e-3}, {"max_iterations": 7}):
-        again = fit(Cart(mass=1.6), [run(0.2), run(-0.4)], ("mass",), **options)
+        again = mass_of([run(0.2), run(-0.4)], 1.6, **options)
         assert again["mass"].value == pytest.approx(2.0, rel=1e-5)
     assert not compilations
     assert first["mass"].value == pytest.approx(2.0, rel=1e-6)
@@ -464,17 +462,14 @@ def test_many_runs_with_unknown_starts_are_those_of_a_dense_fit():
         )
         for k in range(8)
     ]
-    found = fit(Cart(mass=1.8), runs, ("mass",))
+    found = mass_of(runs, 1.8)
     assert found.converged
     assert len(found.labels) == 9
 
     def dense(theta):
-        rate, parts = 0.6 / (2 * theta[0]), []
+        parts = []
         for run, x0 in zip(runs, theta[1:], strict=True):
-            w, a = np.sqrt(5.0 / theta[0] - rate**2), x0 - 0.2
-            decay, b = np.exp(-rate * TS), rate * a / np.sqrt(5.0 / theta[0] - rate**2)
-            x = 0.2 + decay * (a * np.cos(w * TS) + b * np.sin(w * TS))
-            v = -rate * (x - 0.2) + decay * w * (b * np.cos(w * TS) - a * np.sin(w * TS))
+            x, v = cart_motion(TS, x0, 0.0, 1.0, theta[0])
             parts += [(x - run.values["x"]) / 0.01, (v - run.values["x_rate"]) / 0.02]
         return np.concatenate(parts)
 
@@ -485,7 +480,7 @@ def test_many_runs_with_unknown_starts_are_those_of_a_dense_fit():
     step = np.linalg.lstsq(J, -dense(theta), rcond=None)[0]
     assert np.max(np.abs(step) / found.standard_errors) < 1e-3
     # one run less is the same program, and costs no more than its runs
-    assert fit(Cart(mass=1.8), runs[:7], ("mass",)).converged
+    assert mass_of(runs[:7], 1.8).converged
 
 
 # Huber's loss bounds the influence of a sample, that of Student's t goes to zero
@@ -524,7 +519,7 @@ def test_a_sigma_that_is_not_known_is_told_and_ends_at_a_floor_where_a_channel_i
         exact = cart_run(
             values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": Sensor("x", gain=scale)}
         )
-        met = fit(Cart(mass=1.7), exact, ("mass",))
+        met = mass_of(exact)
         assert met.converged
         assert met.sigma["mine"] == pytest.approx(1e-10 * scale * np.max(np.abs(x)), rel=1e-3)
 
@@ -532,18 +527,13 @@ def test_a_sigma_that_is_not_known_is_told_and_ends_at_a_floor_where_a_channel_i
 def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
     ts = np.linspace(0.0, 4.0, 101)
     repeats = [[noisy(100 * k + i, memory=0.9, ts=ts) for i in range(8)] for k in range(25)]
-    found = [fit(Cart(mass=1.9), runs, ("mass",), errors="runs") for runs in repeats]
-    claimed = fit(Cart(mass=1.9), repeats[0], ("mass",))
+    found = [mass_of(runs, 1.9, errors="runs") for runs in repeats]
+    claimed = mass_of(repeats[0], 1.9)
     assert "residuals of `x` (0." in claimed.warning
     assert "are not white" in str(claimed)
     assert 0.75 < claimed.autocorrelation["x"][0] < 0.95
     assert found[0].warning == ""
-    own = fit(
-        Cart(mass=1.9),
-        [noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)],
-        ("mass",),
-        errors="runs",
-    )
+    own = mass_of([noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)], 1.9, errors="runs")
     assert "which makes intervals of unknowns of single runs (`run 0: x`)" in own.warning
     spread = np.std([float(f["mass"].value) for f in found])
     honest, naive = (

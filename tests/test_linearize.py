@@ -26,6 +26,7 @@ from jourdain_jax.studies import Normal
 
 
 SPEEDS = np.arange(11.0)
+CIRCLE = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}  # near a steady circle of a disc
 DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
 
 
@@ -74,11 +75,9 @@ def test_lean_and_steer_torque_act_on_lean_and_steer(bicycles):
     assert relative_error(bicycles.F, np.broadcast_to(np.eye(2), (11, 2, 2))) < ROUND_OFF
 
 
-def test_the_dependent_pitch_is_found_without_being_named():
-    bicycle = WhippleBicycle()
-    small = linearize(bicycle, _running(bicycle, 5.0), ("lean", "steer"))
-    assert "pitch" not in small.states
-    assert len(small.states) == 7 + 3
+def test_the_dependent_pitch_is_found_without_being_named(at_five):
+    assert "pitch" not in at_five.states
+    assert len(at_five.states) == 7 + 3
 
 
 def test_a_bicycle_that_leans_is_not_steady_and_says_so():
@@ -158,9 +157,7 @@ def test_a_prescribed_motion_is_not_steady_while_it_accelerates():
 
 def test_privileged_speeds_may_be_named_in_any_order():
     disc = TiltingDisc(**DISC)
-    circle = jj.steady(
-        disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate")
-    ).state
+    circle = jj.steady(disc, CIRCLE, held=("lean", "yaw_rate")).state
     named = (None, "spin_rate yaw_rate lean_rate")
     assert_allclose(
         *(linearize(disc, circle, privileged=speeds).state_eigenvalues() for speeds in named), atol=1e-12
@@ -370,9 +367,7 @@ def test_an_upright_disc_is_stable_above_its_critical_spin():
 
 
 def test_steady_turns_of_a_disc_meet_their_closed_form():
-    found = jj.family(
-        TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0}
-    )
+    found = jj.family(TiltingDisc(), CIRCLE, held="lean", until={"yaw_rate": 6.0})
     assert_allclose(
         found["spin_rate"],
         -rolling_disc.steady_circle(np.pi / 2 + 0.3, found["yaw_rate"], **DISC)["spin_rate"],
@@ -380,8 +375,13 @@ def test_steady_turns_of_a_disc_meet_their_closed_form():
     )
 
 
+def hanging():
+    """The bottom of the hoop at rates up to 6 rad/s."""
+    return jj.family(HoopBead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+
+
 def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
-    bottom = jj.family(HoopBead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    bottom = hanging()
     (branch,) = bottom.branches
     critical = np.sqrt(9.81 / 0.5)
     assert branch["turning"] == pytest.approx(critical, abs=1e-9)
@@ -449,15 +449,11 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
 @pytest.mark.parametrize(
     ("guess", "options", "says"),
     [
-        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {}, "2 freedoms.*name 1 of `lean`.*`held`"),
+        (CIRCLE, {}, "2 freedoms.*name 1 of `lean`.*`held`"),
         ({"leen": 0.3}, {}, "did you mean `lean`"),
         ({"lean": 0.3}, {"vary": "radios"}, "did you mean `radius`"),
         ({"lean": 0.3}, {"until": {"x": 1.0}}, "`x` is not an unknown"),
-        (
-            {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0},
-            {"held": "lean", "names": ("one",)},
-            "expected one for each of the 2 modes",
-        ),
+        (CIRCLE, {"held": "lean", "names": ("one",)}, "expected one for each of the 2 modes"),
         ({"lean": float("nan")}, {}, "undefined near the guess"),
         (
             {"spin_rate": -4.0},
@@ -492,31 +488,34 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         turns["leam"]
 
 
-def test_all_derivatives_of_eigenvalues_are_those_of_the_formulas(bicycle):
-    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
-    weave, capsize = small.sensitivities("weave"), small.sensitivities("capsize")
+@pytest.fixture(scope="module")
+def at_five(bicycle):
+    return linearize(bicycle, _running(bicycle, 5.0), ("lean", "steer"))
+
+
+def test_all_derivatives_of_eigenvalues_are_those_of_the_formulas(at_five):
+    weave, capsize = at_five.sensitivities("weave"), at_five.sensitivities("capsize")
     for name, (of_weave, of_capsize, *_) in whipple_bicycle.AT_5.items():
         assert weave[name] == pytest.approx(of_weave, rel=1e-10)
         assert capsize[name] == pytest.approx(of_capsize, rel=1e-10)
     assert weave.held == ("x_rate",)
     assert len(weave.by_parameter) == 26
     assert "12.1856-4.41854i" in str(weave)
-    refused("did you mean `weave`", small.sensitivities, "weve")
+    refused("did you mean `weave`", at_five.sensitivities, "weve")
 
 
-def test_shapes_of_modes_from_both_sides(bicycle):
-    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
-    modes = small.modes()
+def test_shapes_of_modes_from_both_sides(at_five):
+    modes = at_five.modes()
     assert modes.names == ("castering", "weave", "weave", "capsize")
     for s, right, left in zip(modes.eigenvalues, modes.shapes.T, modes.left.T, strict=True):
-        P = small.M * s**2 + small.C * s + small.K
+        P = at_five.M * s**2 + at_five.C * s + at_five.K
         assert_allclose(P @ right, 0.0, atol=1e-9)
         assert np.max(np.abs(right)) == pytest.approx(1.0, abs=1e-12)
         assert_allclose(left.conj() @ P, 0.0, atol=1e-9)
     assert np.all(modes.condition > 0.1)
-    assert small.modes(("a", "b", "c", "d")).names == ("a", "b", "c", "d")
+    assert at_five.modes(("a", "b", "c", "d")).names == ("a", "b", "c", "d")
     with pytest.raises(ValueError, match="expected one for each of the 4 modes"):
-        _ = small.modes(("a",)).names
+        _ = at_five.modes(("a",)).names
 
 
 def test_a_double_eigenvalue_has_no_derivative(bicycle, straight):
@@ -634,7 +633,7 @@ def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
 
 def test_points_that_meet_are_no_functions_of_parameters():
     """The bead's pair meets where its equilibria branch: any asymmetry takes this point away."""
-    bottom = jj.family(HoopBead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    bottom = hanging()
     point = jj.critical(HoopBead(radius=0.8), bottom, "double root")
     assert point.code != 0
     assert np.isnan(point["turning"])

@@ -167,7 +167,7 @@ def test_latex_rounds_long_numbers_only():
     pytest.importorskip("sympy")
     program = jj.lower(Sloped())
     assert program.latex() == r"\ddot{x} &= 2.89905"
-    assert program.expressions()["d_x_rate"] == pytest.approx(9.81 * np.sin(0.3), rel=1e-14)
+    assert float(program.expressions()["d_x_rate"]) == pytest.approx(9.81 * np.sin(0.3), rel=1e-14)
     assert jj.lower(PushedByHalf()).latex() == r"\ddot{x} &= \frac{1}{2}"
 
 
