@@ -118,7 +118,8 @@ def records(quick):
     scene, name, lanes = jj.models.WhippleBicycle(), "whipple-bicycle", 2 if quick else 8
     start, times = jj.start(scene, rear_spin_rate=15.0, lean_rate=0.05), np.linspace(0.0, 2.0, 201)
     torques = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=(lanes, 201)))
-    parameters = {name: getattr(scene, name) for name in ("mB", "IBxx", "zB", "mH")}
+    names = ("mB", "IBxx", "zB", "mH")
+    parameters = jnp.stack([getattr(scene, name) for name in names])
 
     def wave(torque):
         size, phase = torque[:2]
@@ -129,7 +130,8 @@ def records(quick):
     def rates(backend, kind, parameters, torque):
         inputs = {"steer_torque": kinds[kind](torque)}
         options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": 1e-8, "atol": 1e-8, "events": False}
-        return jj.simulate(scene.replace(**parameters), start, inputs=inputs, backend=backend, **options).u
+        own = scene.replace(**dict(zip(names, parameters, strict=True)))
+        return jj.simulate(own, start, inputs=inputs, backend=backend, **options).u
 
     def call(backend, kind, function):
         run = jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0)))
