@@ -15,7 +15,7 @@ has full column rank; its pseudo-inverse is computed by Q R.
 """
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -169,9 +169,11 @@ class Special(eqx.Module):
             return self.rows(X + dX, near, values + jnp.stack(along))
 
         G, slope = jax.linearize(linear, jnp.zeros_like(X))
-        Q, T = jnp.linalg.qr(jax.vmap(slope, out_axes=1)(jnp.eye(len(X))))
-        inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
-        return inverse @ G, inverse, jnp.min(pivots) / jnp.max(pivots)
+        # the last column of the triangular factor is Q' G: where only the step is needed, XLA leaves Q out
+        Q, T = jnp.linalg.qr(jnp.column_stack([jax.vmap(slope, out_axes=1)(jnp.eye(len(X))), G]))
+        Q, T, rest = Q[:, :-1], T[:-1, :-1], T[:-1, -1]
+        pivots, solved = jnp.abs(jnp.diagonal(T)), partial(jax.scipy.linalg.solve_triangular, T)
+        return solved(rest), solved(Q.T), jnp.min(pivots) / jnp.max(pivots)
 
     def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
         """Return the point of a scene at X."""
