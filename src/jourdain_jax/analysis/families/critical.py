@@ -171,7 +171,8 @@ class Special(eqx.Module):
         G, slope = jax.linearize(linear, jnp.zeros_like(X))
         # the last column of the triangular factor is Q' G: where only the step is needed, XLA leaves Q out
         Q, T = jnp.linalg.qr(jnp.column_stack([jax.vmap(slope, out_axes=1)(jnp.eye(len(X))), G]))
-        Q, T, rest = Q[:, :-1], T[:-1, :-1], T[:-1, -1]
+        n = len(X)
+        Q, T, rest = Q[:, :n], T[:n, :n], T[:n, n]
         pivots, solved = jnp.abs(jnp.diagonal(T)), partial(jax.scipy.linalg.solve_triangular, T)
         return solved(rest), solved(Q.T), jnp.min(pivots) / jnp.max(pivots)
 
