@@ -170,7 +170,7 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
     assert not any(share.complete for share in shares)
     assert "run it again" in str(shares[0])
     assert shares[3].counts == {}
-    with pytest.raises(ValueError, match="no share"):
+    with pytest.raises(ValueError, match="not a share"):
         merge_studies(paths[0], [run(tmp_path / "other.zarr", seed=4).store.path])
     assert_same(merge_studies(paths[3], paths[:3]), whole)
 

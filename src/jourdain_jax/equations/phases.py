@@ -9,7 +9,7 @@
     event       normal          tangent                      law
     flies       gap
     rolls       L_n             (mu_s L_n)^2 - |L_t|^2
-    slips       L_n             e.w_t                        1 - mu G_nt.e/G_nn (Painleve's paradox at 0)
+    slips       L_n             e.w_t                        G_nn - mu G_nt.e (Painleve's paradox at 0)
 
 A phase ends when one of the values in its line falls through zero; the head of the column names the event.
 The event `law` ends the motion, also of a disc or wheel that falls flat. If forces jump beyond their bounds,
@@ -252,7 +252,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
         holds = bound * bound - tangential @ tangential
         while_closed = jnp.where(number == ROLLS, holds, along + STOPS)
         events[f"{name} tangent"] = jnp.where(number == FLIES, one, while_closed)
-        bears, stands = _bearing(at, i) - NEARLY, one
+        bears, stands = _bearing(at, i), one
         if (above := at.above_flat[i]) is not None:
             stands = jnp.where(number == ROLLS, above, one)
             bears = bears * above / jnp.sqrt(bears**2 + above**2)  # zero with either factor
@@ -331,14 +331,14 @@ def contacts_at_start(at: At) -> Float[Array, "numbers"]:
     begun = after(at.then(numbers, e, q, u), first, strikes, no, no)
     numbers, q, u = begun.numbers, with_slots(q, begun.slots), begun.u
     then = at.then(numbers, begun.slots, q, u)
-    bears = jnp.stack([_bearing(then, i) > NEARLY for i in range(len(numbers))])
+    bears = jnp.stack([_bearing(then, i) > 0 for i in range(len(numbers))])
     numbers = jnp.where((numbers == SLIPS) & ~bears, PAINLEVE, numbers)
     return jnp.concatenate([numbers, jnp.max(-gap, initial=0.0)[None], q, u])
 
 
 def _bearing(at: At, i: int) -> Scalar:
-    """Return `1 - mu G_nt.e/G_nn`, the share of the normal response that friction leaves while contact i
-    slips.
+    """Return the normal response `G_nn - mu G_nt.e` of contact i while it slips, less a small share of G_nn;
+    positive where the ground can bear the body.
     """
     normal = at.alone(i, at.found.b, at.modes)[0][0]
-    return 1 - at.friction[i] * (normal[1:3] @ at.modes.direction[i]) / normal[0]
+    return (1 - NEARLY) * normal[0] - at.friction[i] * (normal[1:3] @ at.modes.direction[i])
