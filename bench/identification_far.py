@@ -37,12 +37,19 @@ def unstable_run(seed):
     start |= {"lean_rate": 0.0, "steer_rate": 0.0}
     motion = jj.simulate(bicycle, start, ts=ts, rtol=1e-8, atol=1e-8)
     values = seen(motion, {"lean": sigma, "steer": sigma}, np.random.default_rng(0))
-    off = np.random.default_rng(100 + seed).uniform(-0.5, 0.5, 7)
+    draw = np.random.default_rng(100 + seed)
+    possible = False
+    while not possible:  # a rear frame that a body can have
+        off = draw.uniform(-0.5, 0.5, 7)
+        of = dict(zip(OF_BICYCLE, off[4:], strict=True))
+        guess = bicycle.replace(**{name: getattr(bicycle, name) * (1 + by) for name, by in of.items()})
+        tensor = [[guess.IBxx, guess.IBxz], [guess.IBxz, guess.IBzz]]
+        moments = np.sort([*np.linalg.eigvalsh(tensor), guess.IByy])
+        possible = moments[2] <= moments[0] + moments[1]
     begin = {"lean": 0.002 * (1 + off[0]), "steer": 0.004 * (1 + off[1])}
     begin |= {"lean_rate": 0.006 * off[2], "steer_rate": 0.006 * off[3]}
-    guesses = {name: getattr(bicycle, name) * (1 + by) for name, by in zip(OF_BICYCLE, off[4:], strict=True)}
     run = jj.Experiment(ts, values, sigma, start=start | begin, unknown_start=tuple(begin))
-    return bicycle.replace(**guesses), run
+    return guess, run
 
 
 def chaotic_run(seed, span):

@@ -28,7 +28,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
     "code tokens of tests": 328_467,
-    "code tokens of bench": 99_812,
+    "code tokens of bench": 99_893,
     "test files that reach private names": 34,
 }
 
