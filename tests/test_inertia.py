@@ -424,6 +424,27 @@ def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, ba
         assert (int(found), bool(jnp.isfinite(q).all())) == (code, code == results.SUCCESS)
 
 
+@pytest.mark.parametrize(
+    ("moments", "stretch"), [((1.0, -0.2, 1.0), 1.0), ((1.0, 1.0, 2.2), 1.0), ((1.0, 1.0, 1.0), 1.1)]
+)
+def test_an_impossible_body_without_parameters_is_a_code_where_others_are_traced(moments, stretch):
+    class Sprung(jj.Scene):
+        stiffness: float = jj.parameter(1.0)
+        coordinates = jj.coordinates("yaw pitch")
+
+        def bodies(self, t, q):
+            turned = jj.rot_z(q.yaw) @ jj.rot_y(q.pitch)
+            return {
+                "odd": jj.RigidBody(1.0, jnp.diag(jnp.array(moments)), jnp.zeros(3), turned * stretch),
+                "frame": jj.RigidBody(1.0, jnp.eye(3), jnp.zeros(3), turned),
+            }
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, yaw_rate=-self.stiffness * motion.q.yaw),)
+
+    assert int(compiled(Sprung(), "auto")[0]) == results.BAD_PARAMETER
+
+
 class Led(jj.Scene):
     """A wheel whose height a geometric row leads, and a rod with a point on a plane of its own, right at the
     start.

@@ -73,6 +73,28 @@ class TurningBody(Turning):
         return inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))
 
 
+class Driven(Turning):
+    """A body under two springs, whose pitch turns a flywheel with a moment of 1.2 kg m^2."""
+
+    def bodies(self, t, q):
+        flywheel = jj.RigidBody(
+            0.0, jnp.diag(jnp.array([0.0, 1.2, 0.0])), jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_y(q.pitch)
+        )
+        return super().bodies(t, q) | {"flywheel": flywheel}
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_a_fit_passes_moments_that_no_body_has_and_names_the_body_of_such_a_minimum(backend):
+    ts, start = np.linspace(0.0, 4.0, 41), {"yaw": 0.8, "pitch": 1.0}
+    motion = jj.simulate(Driven(), start, ts=ts)
+    data = jj.Experiment(ts, {name: motion[name] for name in ("yaw", "pitch")}, 0.01, start=start)
+    fit = jj.fit(Turning(), data, ("moments",), backend=backend)
+    assert fit.converged
+    assert_allclose(fit.scene.moments, [0.5, 1.9, 0.4], rtol=1e-6)
+    assert "above the sum of the others" in fit.impossible[0]
+    assert "above the sum of the others" in str(fit)
+
+
 def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     truth = jnp.array([0.5, 0.899, 0.4])  # Iyy is nearly the sum of the other two
     ts, start = np.linspace(0.0, 4.0, 41), {"yaw": 0.8, "pitch": 1.0}

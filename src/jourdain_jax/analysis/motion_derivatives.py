@@ -38,7 +38,7 @@ from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.row_program import row_program
-from jourdain_jax.structure.structure import structure_of, usual_rows
+from jourdain_jax.structure.structure import check_bodies, structure_of, usual_rows
 
 Slopes = tuple[Float[Entries, "values"], Float[Entries, "values columns"], Float[Entries, "_ _"]]
 Nodes = Int[np.ndarray, "_ _"]
@@ -185,6 +185,7 @@ def instant_of(scene: Scene | BuiltFor, constant: Indices, masses: bool = False)
     instant. `constant`: indices of the speeds whose accelerations are needed; `masses`: whether the mass
     matrix is needed.
     """
+    check_bodies(as_scene(scene))
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
     try:

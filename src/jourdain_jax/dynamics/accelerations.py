@@ -72,7 +72,7 @@ from jourdain_jax.scene.arguments import (
 from jourdain_jax.scene.contact.contacts import Contact
 from jourdain_jax.scene.coordinates import Labels, check_name, check_names
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.structure import structure_of, usual_rows
+from jourdain_jax.structure.structure import check_bodies, structure_of, usual_rows
 
 
 class Baumgarte(eqx.Module):
@@ -186,7 +186,7 @@ def accelerations(
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
     if usual is None:
-        structure_of(scene)  # raises for impossible values of the scene
+        check_bodies(scene)
         usual = usual_rows(scene)
     return _accelerations(
         scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual

@@ -41,7 +41,7 @@ class OwnSteps(Integrator):
     """Loop over steps by a Runge-Kutta tableau, an implicit method or Taylor series."""
 
     solver: Method | ImplicitMethod
-    alongside: bool  # compute values and tangents in one run; for `jvp` and `jacfwd` only
+    tried: bool
     max_steps: int
     event_names: tuple[str, ...]
     native: bool  # whether machine code may integrate
@@ -72,7 +72,7 @@ class OwnSteps(Integrator):
         def run(setup: Setup, begun: Begun) -> Solved:
             form, start, flow, back, reason = way(*in_sides(setup, begun))
             rules = Rules(pushed_by_jax(flow), partial(_pulled, back), lambda *_: reason())
-            found = (flow if self.alongside else with_rules(flow, rules))(start)
+            found = (flow if self.tried else with_rules(flow, rules))(start)
             return native_motion.solved(form, start.goals, found)
 
         return _on_times(run, mover, setup, begun)

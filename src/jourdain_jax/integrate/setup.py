@@ -86,6 +86,7 @@ class Integrator(abc.ABC):
 
     max_steps: int
     event_names: tuple[str, ...]
+    tried: bool  # as in `AllOptions`
     solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
     own: ClassVar[bool]  # whether steps end at relations, and states are projected onto the constraints
 

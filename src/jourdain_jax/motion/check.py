@@ -47,9 +47,8 @@ def check(scene: Scene | BuiltFor) -> Checked:
 
     The check samples states of the domain, so it may miss a narrow feature between them. `verify` also
     prints this table, and the first `build` of a class issues it as a warning. Building or moving the scene
-    raises the first finding as an error, with two exceptions: a program that differs (dense matrices replace
-    it), and a moment of inertia above the sum of the two others by 1 to 5 %. Raises ValueError if there is no
-    admissible state, or if a free motion has no inertia.
+    raises the first finding as an error, except for a program that differs (dense matrices replace it).
+    Raises ValueError if there is no admissible state, or if a free motion has no inertia.
     """
     return _checked(as_scene(scene), None)
 
@@ -61,7 +60,7 @@ def _checked(scene: Scene, every_speed: bool | None) -> Checked:
     found = {
         "smoothness": known.kinks,
         "grounds": known.odd_grounds,
-        "bodies": known.faults or known.odd_bodies,
+        "bodies": known.faults or known.impossible,
         "scalar program": (
             (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else ()
         ),

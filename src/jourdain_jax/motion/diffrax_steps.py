@@ -79,7 +79,7 @@ class Diffrax(eqx.Module, Integrator):
     """Integrator that calls `diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
-    alongside: bool = static()  # as in `OwnSteps`
+    tried: bool = static()
     max_steps: int = static()
     event_names: tuple[str, ...] = static()
     own: ClassVar[bool] = False
@@ -97,7 +97,7 @@ class Diffrax(eqx.Module, Integrator):
             partial(self._solved, adjoint)
             for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint())
         )
-        run = forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE)
+        run = forward if self.tried else by_modes(forward, reverse, SECOND_ORDER_MESSAGE)
         # a state that is NaN ends the motion at once; a span of 1e-9 s stands for times that may not fit
         begins = begun.code == RUNNING
         y0 = jax.tree.map(lambda x: jnp.where(begins, x, jnp.nan), begun.y0)

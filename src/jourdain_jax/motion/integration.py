@@ -268,7 +268,7 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
     unneeded = setup.judged or (program is not None and not program.others)
     others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
     if program is None:
-        faults = faults_at(scene, *at, others)
+        faults = faults_at(scene, *at, others, not setup.integrator.tried)
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
     else:
@@ -280,7 +280,8 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
         )
         given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
         found = value_kernels.nodes_called(program.graph, program.right, given)(*stopped(parts))
-        right, finite = found > 0
+        right, possible, finite = found > 0
+        right = right & (possible | setup.integrator.tried)
     fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
     code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
     worst = jnp.min(at[-1][len(scene.inputs) - len(scene.switching.contacts) :], initial=0.0)

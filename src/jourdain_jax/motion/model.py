@@ -30,7 +30,13 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.probes import coordinates_on_rows
 from jourdain_jax.structure.row_program import row_program
-from jourdain_jax.structure.structure import Reference, Structure, structure_of, structure_whatever_its_faults
+from jourdain_jax.structure.structure import (
+    Reference,
+    Structure,
+    check_bodies,
+    structure_of,
+    structure_whatever_its_faults,
+)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -329,7 +335,7 @@ def build(
     impossible bodies, or if formulation or backend do not suit the scene.
     """
     scene = as_scene(scene)
-    structure_of(scene)  # raises an error for an invalid scene
+    check_bodies(scene)  # raises an error for an invalid scene
     model = modelled(scene, formulation, backend)
     model.usual(False), model.usual(True), model.way
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")

@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import jax
@@ -79,7 +79,9 @@ class AllOptions(Options):
     formulation: "Formulation | None" = None
     backend: str = "auto"
     memory: int | None = None  # of a model: limit in bytes for batches and reverse mode; None: `setup.MEMORY`
-    alongside: bool = False  # compute values and tangents in one run; for `jvp` and `jacfwd` only
+    # whether a fit tries these parameters: values and tangents are computed in one run, for `jvp` and
+    # `jacfwd` only, and moments of inertia may be impossible, since the minimum may lie beyond such a body
+    tried: bool = False
 
 
 class OptionFields(TypedDict, total=False):
@@ -108,7 +110,7 @@ class MotionFields(OptionFields, total=False):
 
 
 SPAN = ("t0", "t1", "ts", "inputs")  # arguments of a motion by name besides its options
-_STATIC = ("max_steps", "max_transitions", "events", "work", "retry", "backend", "memory", "alongside")
+_STATIC = ("max_steps", "max_transitions", "events", "work", "retry", "backend", "memory", "tried")
 OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
@@ -200,11 +202,6 @@ def bytes_of(memory: Any) -> int:
             f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'"
         )
     return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
-
-
-def alongside(options: AllOptions) -> AllOptions:
-    """Return the options, set to compute values and tangents in one run; for `jvp` and `jacfwd` only."""
-    return replace(options, alongside=True)
 
 
 def stated(options: AllOptions) -> dict[str, Any]:

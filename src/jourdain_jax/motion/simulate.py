@@ -52,7 +52,7 @@ from jourdain_jax.scene.arguments import (
     warn,
 )
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.structure.structure import is_judged
+from jourdain_jax.structure.structure import check_bodies, is_judged
 
 if TYPE_CHECKING:
     from jourdain_jax.motion import diffrax_steps
@@ -180,11 +180,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     if not constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
     events = field.event_names if options.events or not all(field.stops) else ()
-    static: dict[str, Any] = {
-        "max_steps": options.max_steps,
-        "event_names": events,
-        "alongside": options.alongside,
-    }
+    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": events, "tried": options.tried}
     own = own_steps(
         solver,
         **static,
@@ -201,6 +197,8 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     judged = model.once("judged", lambda: is_judged(scene))
+    if not options.tried:
+        model.once("possible", lambda: check_bodies(scene))
     steps = tolerances, first_step, longest, integrator
     apart = lambda: bool(abs(t1 - t0) > 1e3 * eps_of(t1) * abs(t1))  # otherwise default times may coincide
     fits = not is_traced(t0, t1, ts) and (given_ts is not None or apart())

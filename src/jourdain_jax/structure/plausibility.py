@@ -52,7 +52,7 @@ class Check:
     wrong: Callable
     says: Callable[[np.ndarray], str]
     label: str = ""
-    group: str = "faults"  # or "gravity"; "grounds" and "moments" for numbers that are possible but unlikely
+    group: str = "faults"  # or "gravity"; "moments", which a fit may pass; "grounds", possible but unlikely
 
 
 def _size(x):
@@ -68,14 +68,14 @@ def _negative(x):
     return _indefinite(_scaled(x) + TOLERANCE * np.eye(3))
 
 
-def _exceeds_the_others(x, by=ROUNDED):
-    """Return whether the largest moment of a body exceeds the sum of the others by more than the fraction
-    `by`. For thin wheels both are equal. A moment about one axis alone is exempt, since in a plane the others
-    have no effect.
+def _exceeds_the_others(x):
+    """Return whether the largest moment of a body exceeds the sum of the others by more than errors of
+    measured values. For thin wheels both are equal. A moment about one axis alone is exempt, since in a plane
+    the others have no effect.
     """
     I = _scaled(x)
     trace, pairs, _ = _invariants(I)
-    less = trace[..., None, None] * np.eye(3) - (1 + 1 / (1 + by)) * I
+    less = trace[..., None, None] * np.eye(3) - (1 + 1 / (1 + ROUNDED)) * I
     return (pairs > TOLERANCE) & _indefinite(less) & ~_negative(x)
 
 
@@ -235,7 +235,13 @@ CHECKS = (
         ),
         "a negative moment of inertia",
     ),
-    Check("inertia", _exceeds_the_others, _says_moments, "a moment of inertia above the sum of the others"),
+    Check(
+        "inertia",
+        _exceeds_the_others,
+        _says_moments,
+        "a moment of inertia above the sum of the others",
+        "moments",
+    ),
     Check(
         "orientation",
         lambda R: _from_identity(R) > TOLERANCE,
@@ -304,7 +310,6 @@ CHECKS = (
         "grounds",
     ),
     *(_stated_twice(kind) for kind in ("plane", "own plane")),
-    Check("inertia", lambda x: _exceeds_the_others(x, ROUNDED / 5), _says_moments, group="moments"),
 )
 
 
@@ -317,9 +322,12 @@ def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return random_states(scene, 3, np.random.default_rng(0))
 
 
-def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"]) -> dict[str, Flag]:
+def faults_at(
+    scene: Scene, t, q, u, inputs, others: Float[Array, "others coordinates"], moments: bool = True
+) -> dict[str, Flag]:
     """Return for each fault whether it occurs at (t, q, u), or at a state from `elsewhere` with the
-    coordinates `others`. This works under jit and vmap. NaN does not count as a fault.
+    coordinates `others`. This works under jit and vmap. NaN does not count as a fault. `moments`: whether
+    moments of inertia above the sum of the others are a fault.
     """
     times, _, speeds = (x[: len(others)] for x in elsewhere(scene))
     pairs = zip(map(jnp.asarray, (t, q, u)), (times, others, speeds), strict=True)
@@ -328,7 +336,8 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
     numbers = jax.lax.map(
         lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states
     )
-    seen = ((check, name, x) for check in CHECKS if check.label for name, x in numbers[check.of].items())
+    checks = [check for check in CHECKS if check.label and (moments or check.group != "moments")]
+    seen = ((check, name, x) for check in checks for name, x in numbers[check.of].items())
     found = {f"{check.label}: {name}": jnp.any(check.wrong(x)) for check, name, x in seen}
     if len(others) and checks_inertia(scene):
         at, place, moving = (x[0] for x in elsewhere(scene))
@@ -339,13 +348,12 @@ def faults_at(scene: Scene, t, q, u, inputs, others: Float[Array, "others coordi
     return found
 
 
-def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether any number fails its check. `stacked`: kind -> numbers, with axes of states and of the
-    bodies or contacts that have them.
+def any_wrong(stacked: dict[str, Array], moments: bool) -> Flag:
+    """Return whether any number fails its check: of moments of inertia, or any other check. `stacked`: kind
+    -> numbers, with axes of states and of the bodies or contacts that have them.
     """
-    found = [
-        check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked
-    ]
+    checks = [check for check in CHECKS if check.label and (check.group == "moments") == moments]
+    found = [check.wrong(stacked[check.of]).ravel() for check in checks if check.of in stacked]
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
 
 
@@ -356,7 +364,7 @@ def impossible_bodies(scene: Scene, q) -> Sentences:
         m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
     stated = {kind: at_index(x, None) for kind, x in _weights(scene, q).items()}
-    return sentences(scene, stated, "faults") or sentences(scene, stated, "moments")
+    return sentences(scene, stated, "faults") + sentences(scene, stated, "moments")
 
 
 @eval_numpy

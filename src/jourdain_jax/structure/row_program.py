@@ -50,7 +50,7 @@ class RowProgram:
     phi: Indices
     A: Matrix
     M: Matrix | None  # lower triangle; None if too large to be written out
-    right: Indices  # truth values: parameters and bodies are valid; the state is finite
+    right: Indices  # truth values: valid parameters and bodies; possible moments of inertia; a finite state
     others: (
         Indices  # coordinates of other states, on the geometric constraints, on which `right` also depends
     )
@@ -98,13 +98,12 @@ def row_program(scene: Scene) -> RowProgram | None:
 
 
 def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple[list[int], list[int]]:
-    """Return the nodes of two truth values, for valid parameters and for a finite state, and the coordinates
-    of other states on which they depend.
+    """Return the nodes of three truth values, for valid parameters, possible moments of inertia and a finite
+    state, and the coordinates of other states on which they depend.
 
-    Parameters are valid if each is finite, has its required sign, causes no fault of `plausibility.CHECKS`
-    at the start and at states from `elsewhere`, and leaves no free motion without inertia. The coordinates of
-    these states depend on parameters if the geometric constraints do. Faults that do not depend on parameters
-    are found when the scene is probed.
+    Parameters are valid if each is finite, has its required sign, causes no other fault of
+    `plausibility.CHECKS` at the start and at states from `elsewhere`, and leaves no free motion without
+    inertia. The coordinates of these states depend on parameters if the geometric constraints do.
     """
     g, traced = looked.graph, looked.traced
     states, count = list(zip(*elsewhere(scene), strict=True)), len(traced.q) if len(traced.at.closure) else 0
@@ -112,24 +111,28 @@ def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple
     of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
     held = traced.q.tolist() if any(depend_on(g, looked.closures, of_parameters)) else []
     varying = [traced.t, *traced.q.tolist(), *traced.u.tolist()]
-    placed = [
-        [g.const(t), *(own or map(g.const, q)), *map(g.const, u)]
-        for (t, q, u), own in zip(states, on_rows, strict=True)
+    fixed = [dict(zip(varying, map(g.const, np.hstack(state)), strict=True)) for state in states]
+    others = [
+        at | dict(zip(traced.q.tolist(), own, strict=False)) for at, own in zip(fixed, on_rows, strict=True)
     ]
-    others = [dict(zip(varying, state, strict=True)) for state in placed]
 
-    def at_states(nodes: np.ndarray) -> np.ndarray:
+    def at_states(kind: str, nodes: np.ndarray) -> np.ndarray | None:
+        """Return the numbers at the start and elsewhere. Numbers that do not depend on parameters are
+        constants at random states; None if random states violate the geometric constraints.
+        """
         flat = nodes.ravel().tolist()
-        return np.array([flat, *(g.substituted(flat, other) for other in others)]).reshape(-1, *nodes.shape)
+        decided = any(depend_on(g, flat, [*of_parameters, *(held if kind in BY_ROWS else [])]))
+        if not decided and count and any(depend_on(g, flat, traced.q.tolist())):
+            return None
+        places = [{}, *others] if decided else [fixed[0], *fixed]
+        return np.array([g.substituted(flat, at) for at in places]).reshape(-1, *nodes.shape)
 
-    judged = dict.fromkeys(check.of for check in CHECKS if check.label)
-    every = {kind: list(map(np.asarray, traced.particulars.numbers[kind].values())) for kind in judged}
-    deciding = {kind: [*of_parameters, *(held if kind in BY_ROWS else [])] for kind in judged}
-    matters = lambda kind, x: any(depend_on(g, x.ravel().tolist(), deciding[kind]))
-    kept = {kind: [x for x in of if matters(kind, x)] for kind, of in every.items()}
-    stacked = {kind: np.stack([at_states(x) for x in of], 1) for kind, of in kept.items() if of}
-    generic = dict(zip(varying, map(g.const, np.concatenate([np.ravel(x) for x in states[0]])), strict=True))
-    free = _inertia_elsewhere(looked, A, M, generic) if M and _may_vanish(scene, looked) else []
+    stacked: dict[str, np.ndarray] = {}
+    for kind in dict.fromkeys(check.of for check in CHECKS if check.label):
+        numbers = traced.particulars.numbers[kind].values()
+        found = [x for one in numbers if (x := at_states(kind, np.asarray(one))) is not None]
+        stacked |= {kind: np.stack(found, 1)} if found else {}
+    free = _inertia_elsewhere(looked, A, M, fixed[0]) if M and _may_vanish(scene, looked) else []
     state = np.array([*traced.q.tolist(), *traced.u.tolist()])
     nodes = [state, *traced.parameters, *stacked.values(), *free]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
@@ -137,8 +140,10 @@ def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple
     def right(state, *given):
         faults = [*parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()]
         faults += [without_inertia(*given[-2:])] if free else []
-        faults += [any_wrong(dict(zip(stacked, given[count:], strict=False)))]
-        return ~jnp.any(jnp.stack(faults)), jnp.all(jnp.abs(state) < jnp.inf)
+        numbers = dict(zip(stacked, given[count:], strict=False))
+        faults += [any_wrong(numbers, moments=False)]
+        possible = ~any_wrong(numbers, moments=True)
+        return ~jnp.any(jnp.stack(faults)), possible, jnp.all(jnp.abs(state) < jnp.inf)
 
     closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
     found = [int(as_nodes(g, x)) for x in interpret(g, closed, [Nodes(x) for x in nodes])]

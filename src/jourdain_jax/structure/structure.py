@@ -72,7 +72,7 @@ class Structure:
     rows_of_inputs: bool  # constraints depend on inputs; accelerations then depend on their rates
     chosen_by_user: bool
     kinks: Labels  # quantities that are not smooth, as sentences
-    odd_bodies: Labels  # bodies with moments of inertia that no distribution of mass has
+    impossible: Labels  # bodies with moments of inertia that no distribution of mass has
     odd_grounds: Labels  # grounds of contacts whose motion contradicts the stated one
     faults: Labels  # impossible bodies and planes, contradictory constraints; as sentences
     without_inertia: Labels  # a free motion without inertia, as a sentence
@@ -166,8 +166,8 @@ def structure_of(scene: Scene) -> Structure:
     They are found once per class and parameter values, at random and symmetric states of the domain. Concrete
     numbers replace traced parameters. Raises ValueError if no admissible state is found, if bodies do not
     move smoothly, if a free motion has no inertia, or if `privileged` names unknown or too few speeds. For
-    known parameters it is also raised by impossible numbers of bodies or planes and by contradictory
-    constraints.
+    known parameters it is also raised by impossible numbers of bodies or planes, except for moments of
+    inertia (`check_bodies`), and by contradictory constraints.
     """
     structure = structure_whatever_its_faults(scene)
     # findings at replaced parameters prove nothing about bodies and grounds
@@ -175,6 +175,15 @@ def structure_of(scene: Scene) -> Structure:
     if wrong := structure.without_inertia or structure.kinks or of_numbers:
         raise ValueError(wrong[0])
     return structure
+
+
+def check_bodies(scene: Scene) -> None:
+    """Raise ValueError if a body of a known scene has moments of inertia that no distribution of mass has.
+    Fits may pass such values, so `structure_of` accepts them.
+    """
+    impossible = structure_of(scene).impossible
+    if impossible and is_judged(scene):
+        raise ValueError(impossible[0])
 
 
 def structure_whatever_its_faults(scene: Scene) -> Structure:
@@ -325,7 +334,7 @@ def _probed_structure(scene: Scene) -> Structure:
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user is not None,
         kinks=rough,
-        odd_bodies=bodies,
+        impossible=bodies,
         odd_grounds=grounds,
         faults=faults,
         without_inertia=inert,

@@ -44,7 +44,8 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> Sentence
     sample, misses the observed event, or crosses a jump of its loads.
     """
     shared, local = problem.unknowns.split(theta)
-    found, layout, options = [], problem.unknowns.layout, problem.asked.options
+    found, layout = [], problem.unknowns.layout
+    options = replace(problem.asked.options, tried=True)
     for index, run in enumerate(problem.runs):
         one = run_of(run).at(layout, shared, local[index])
         scene = layout.scene(problem.scene, shared)

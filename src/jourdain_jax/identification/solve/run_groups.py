@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from jourdain_jax.identification.inference.correlated_noise import Chains, white
 from jourdain_jax.identification.solve.layout import Layout
 from jourdain_jax.identification.solve.shooting import Run, on_equal_grids, run_of
 from jourdain_jax.integrate.inputs import Sampled
-from jourdain_jax.motion.options import AllOptions, alongside
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.scene import Scene, state_names
 from jourdain_jax.structure.structure import Reference
@@ -299,7 +300,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
 
         def flat(x):
             residuals = run.at(layout, x[own:], x[:own]).residuals(
-                layout.scene(scene, x[own:]), simulate, alongside(options)
+                layout.scene(scene, x[own:]), simulate, replace(options, tried=True)
             )
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
