@@ -35,7 +35,7 @@ class Rolls(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
+        return jj.gravity(motion, GRAVITY)
 
     def contacts(self, pose):
         return {"touch": self.contact(pose, self.make_ground(self, pose))}
@@ -153,7 +153,7 @@ class BallInBowl(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.gravity),)
+        return jj.gravity(motion, self.gravity)
 
     def contacts(self, pose):
         o = 0.0 * self.bowl
@@ -180,7 +180,7 @@ class BallInDrum(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
+        return jj.gravity(motion, GRAVITY)
 
     def contacts(self, pose):
         return {
@@ -206,7 +206,7 @@ class RouthSphere(jj.Scene):
         return {"ball": jj.RigidBody(self.mass, self.moments, middle - self.off * R[:, 2], R)}
 
     def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
+        return jj.gravity(motion, GRAVITY)
 
     def contacts(self, pose):
         return {"floor": jj.ball_contact(pose["ball"], self.radius, centre=jnp.stack([0.0, 0.0, self.off]))}

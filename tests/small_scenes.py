@@ -60,7 +60,7 @@ class DiscWithHeightRow(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.gravity),)
+        return jj.gravity(motion, self.gravity)
 
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["disc"], self.radius, axis="y", height="row")}
@@ -92,7 +92,7 @@ class BeadOnTurningWire(jj.Scene):
         return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0]))}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, r_rate=-self.damping * motion.u.r_rate),)
+        return jj.generalized_force(motion, r_rate=-self.damping * motion.u.r_rate)
 
 
 class DrivenPendulum(jj.Scene):
@@ -174,7 +174,7 @@ class Cart(jj.Scene):
 
     def loads(self, motion):
         force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
-        return (jj.generalized_force(motion, x_rate=force),)
+        return jj.generalized_force(motion, x_rate=force)
 
 
 class Oscillator(jj.Scene):
@@ -189,10 +189,8 @@ class Oscillator(jj.Scene):
         return {"cart": jj.Particle(self.mass, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x
-            ),
+        return jj.generalized_force(
+            motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x
         )
 
 
@@ -230,7 +228,7 @@ class Twice(OnLine):
         x = motion.q.x - self.place
         drag = self.damped + (1 - self.damped) * (12 * x**2 - 3 * self.apart)
         spring = self.damped * (x**3 - 0.75 * self.apart * x) + (1 - self.damped) * x
-        return (jj.generalized_force(motion, x_rate=self.push - drag * motion.u.x_rate - spring),)
+        return jj.generalized_force(motion, x_rate=self.push - drag * motion.u.x_rate - spring)
 
 
 class DrivenSleigh(jj.models.ChaplyginSleigh):
@@ -244,4 +242,4 @@ class DrivenSleigh(jj.models.ChaplyginSleigh):
         c, s, u = jnp.cos(motion.q.heading), jnp.sin(motion.q.heading), motion.u
         push = -self.along * (c * u.x_rate + s * u.y_rate)
         turn = self.torque * jnp.sin(2 * motion.t) - self.turning * u.heading_rate
-        return (jj.generalized_force(motion, x_rate=push * c, y_rate=push * s, heading_rate=turn),)
+        return jj.generalized_force(motion, x_rate=push * c, y_rate=push * s, heading_rate=turn)

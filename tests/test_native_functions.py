@@ -31,10 +31,8 @@ class Pushed(OnPlane):
     inputs = jj.inputs("force aside")
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside
-            ),
+        return jj.generalized_force(
+            motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside
         )
 
     def events(self, motion):

@@ -46,7 +46,7 @@ class Pushed(OnLine):
     level: float = jj.parameter(-0.1)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.t - self.k * motion.q.x),)
+        return jj.generalized_force(motion, x_rate=motion.t - self.k * motion.q.x)
 
     def events(self, motion):
         return {"low": motion.q.x - self.level}
@@ -77,7 +77,7 @@ class Moving(OnLine):
     modes = jj.modes(bead=("goes", "comes"))
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.pull * motion.modes.bead),)
+        return jj.generalized_force(motion, x_rate=self.pull * motion.modes.bead)
 
     def events(self, motion):
         after = {"x_rate": -self.kept * motion.u.x_rate + 0.1 * motion.t}
@@ -90,8 +90,8 @@ class Strip(OnLine):
     width: float = jj.parameter(0.02)
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)),
+        return jj.generalized_force(
+            motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)
         )
 
     def events(self, motion):
@@ -102,7 +102,7 @@ class Dry(OnLine):
     """A bead that dry friction stops."""
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-jnp.sign(motion.u.x_rate)),)
+        return jj.generalized_force(motion, x_rate=-jnp.sign(motion.u.x_rate))
 
 
 def pushed_position(t, x, v, k):

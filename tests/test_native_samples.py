@@ -23,9 +23,7 @@ class Pushed(OnLine):
 
     def loads(self, motion):
         f = motion.inputs
-        return (
-            jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x),
-        )
+        return jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x)
 
     def events(self, motion):
         return {"wall": self.wall - motion.q.x}

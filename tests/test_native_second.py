@@ -30,10 +30,8 @@ class Falling(jj.Scene):
         return {"ball": jj.Particle(self.mass, [0.0, 0.0, q.z])}
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion, z_rate=-self.drag * (motion.u.z_rate - motion.inputs.wind) - 9.81 * self.mass
-            ),
+        return jj.generalized_force(
+            motion, z_rate=-self.drag * (motion.u.z_rate - motion.inputs.wind) - 9.81 * self.mass
         )
 
     def events(self, motion):

@@ -29,7 +29,7 @@ class Driven(OnLine):
 
     def loads(self, motion):
         push = motion.inputs.push + jnp.cos(2.0 * motion.t) - 0.3 * motion.u.x_rate
-        return (jj.generalized_force(motion, x_rate=push - self.stiffness * motion.q.x),)
+        return jj.generalized_force(motion, x_rate=push - self.stiffness * motion.q.x)
 
     def events(self, motion):
         return {"wall": 1.2 + motion.q.x}

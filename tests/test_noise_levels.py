@@ -5,6 +5,7 @@ and intervals of Student's t.
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from scipy.special import stdtrit
 from small_scenes import Bead
 
@@ -183,8 +184,7 @@ def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, 
 
 def test_a_memory_needs_neighbours():
     runs = [run({"x": [2.0 + 0.01 * k]}, 0.1, ("x",), [0.5], t0=0.0, correlation_time=None) for k in range(3)]
-    with pytest.raises(ValueError, match="each run has only one sample"):
-        jj.fit(Bead(), runs)
+    refused("each run has only one sample", jj.fit, Bead(), runs)
 
 
 SLOPES = {

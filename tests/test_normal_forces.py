@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rolling_scenes import GRAVITY, Cart, CartOnRows
-from tolerances import tolerance
+from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
@@ -48,8 +48,8 @@ def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
     drawn = [*drawn[:2], random.uniform(-0.3, 0.3, 6), drawn[2], random.normal(size=6), drawn[3]]
     ours, (expected, right, known), residual = both(*map(jnp.asarray, drawn))
     press, slide = ours[0] - expected, ours[1] - right
-    assert np.max(np.abs(residual)) <= tolerance("round_off")
-    close = tolerance("round_off") * np.max(np.abs(expected)) * 10  # ten: a system of 18 unknowns
+    assert np.max(np.abs(residual)) <= ROUND_OFF
+    close = ROUND_OFF * np.max(np.abs(expected)) * 10  # ten: a system of 18 unknowns
     assert np.max(np.abs(press)) <= close
     assert np.max(np.abs(slide)) <= close
     assert np.all(known)
@@ -120,7 +120,7 @@ class Robot(jj.Scene):
         return made
 
     def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
+        return jj.gravity(motion, GRAVITY)
 
     def contacts(self, pose):
         return {name: jj.disc_contact(pose[name], self.radius) for name in ("left", "right")}

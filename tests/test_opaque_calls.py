@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -101,10 +102,8 @@ class Acted(ChaplyginSleigh):
     def loads(self, motion):
         sleigh = motion["sleigh"]
         along = sleigh.orientation[:, 0]
-        return (
-            jj.point_force(
-                sleigh.point(jnp.zeros(3)), self.law(sleigh.velocity @ along, self.numbers) * along
-            ),
+        return jj.point_force(
+            sleigh.point(jnp.zeros(3)), self.law(sleigh.velocity @ along, self.numbers) * along
         )
 
 
@@ -219,8 +218,11 @@ def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_dens
         atol=1e-10,
     )
     for f in (by_program, dense):
-        with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
-            jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y)))(y[0])
+        refused(
+            "Reverse-mode differentiation does not work",
+            jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y))),
+            y[0],
+        )
 
 
 class OnCam(jj.Scene):
@@ -283,7 +285,7 @@ class Effective(OnLine):
 
     def loads(self, motion):
         jax.debug.callback(lambda x: None, motion.q.x)
-        return (jj.generalized_force(motion, x_rate=-motion.q.x),)
+        return jj.generalized_force(motion, x_rate=-motion.q.x)
 
 
 def test_a_load_with_effects_is_not_taken_out_of_its_place():
@@ -295,12 +297,10 @@ class FarWall(Effective):
     """A spring by a table that is flat in the whole domain, and not beyond."""
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion,
-                x_rate=jnp.interp(
-                    motion.q.x, jnp.array([-20.0, -10.0, 10.0, 20.0]), jnp.array([50.0, 0.0, 0.0, -50.0])
-                ),
+        return jj.generalized_force(
+            motion,
+            x_rate=jnp.interp(
+                motion.q.x, jnp.array([-20.0, -10.0, 10.0, 20.0]), jnp.array([50.0, 0.0, 0.0, -50.0])
             ),
         )
 
@@ -324,10 +324,7 @@ def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources
     )
     assert said == f"a scalar program of {program.operations} operations; {why}"
     for printed in (program.python_source, program.c_source):
-        with pytest.raises(
-            ValueError, match=r"calls of JAX \(the operation `while`\) cannot be written as source"
-        ):
-            printed()
+        refused(r"calls of JAX \(the operation `while`\) cannot be written as source", printed)
 
 
 class WatchedDisc(TiltingDisc):

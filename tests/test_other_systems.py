@@ -19,6 +19,7 @@ import machine_code
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 
 import jourdain_jax as jj
 from jourdain_jax.calculus import files as whole_files
@@ -46,8 +47,7 @@ def test_under_windows_motions_are_integrated_by_xla(monkeypatch):
     host.reason_against.cache_clear()
     try:
         assert set_up(jj.models.TiltingDisc()).reason_against_machine_code == "it requires Linux or macOS"
-        with pytest.raises(ValueError, match="it requires Linux or macOS"):
-            jj.simulate(jj.models.TiltingDisc(), t1=0.1, backend="native")
+        refused("it requires Linux or macOS", jj.simulate, jj.models.TiltingDisc(), t1=0.1, backend="native")
     finally:
         host.reason_against.cache_clear()
 
@@ -282,8 +282,7 @@ def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text):
 def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monkeypatch):
     monkeypatch.setattr(memory, "os", SimpleNamespace(name="nt"))
     monkeypatch.setattr(memory.ctypes, "CDLL", _no_library)
-    with pytest.raises(ValueError, match="`memory` is limited only on Linux with glibc"):
-        memory.give_back_at_once()
+    refused("`memory` is limited only on Linux with glibc", memory.give_back_at_once)
 
 
 def test_a_study_whose_workers_cannot_begin_says_so(tmp_path, monkeypatch):

@@ -6,11 +6,9 @@ import pytest
 from closed_form_runs import end_error
 from oracles import heisenberg_particle, isokinetic_particle, rosenberg_particle, spring_and_rod
 from solved_states import solved_at_random_states, solved_by_every_reduction
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 from jourdain_jax.models import HeisenbergParticle, IsokineticParticle, RosenbergParticle, SpringAndRod
-
-ROUND_OFF, CLOSED_FORM = tolerance("round_off"), tolerance("closed_form")
 
 
 def test_rosenbergs_particle_is_bent_by_its_row():

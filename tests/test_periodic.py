@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from scipy.integrate import solve_ivp
 from small_scenes import DrivenSleigh, OnLine
 
@@ -23,8 +24,8 @@ def on_a_line(force):
         size: float = jj.parameter(1.0)
 
         def loads(self, motion):
-            return (
-                jj.generalized_force(motion, x_rate=force(self.size, motion.q.x, motion.u.x_rate, motion.t)),
+            return jj.generalized_force(
+                motion, x_rate=force(self.size, motion.q.x, motion.u.x_rate, motion.t)
             )
 
         def events(self, motion):
@@ -184,7 +185,7 @@ class Swaying(OnLine):
         t = motion.t
         y, rate = motion.q.x - jnp.sin(t), motion.u.x_rate - jnp.cos(t)
         force = -self.drag * rate - y**2 + self.push - self.wobble * jnp.cos(t) * (y - 1 / 8) - jnp.sin(t)
-        return (jj.generalized_force(motion, x_rate=force),)
+        return jj.generalized_force(motion, x_rate=force)
 
 
 @pytest.mark.parametrize(
@@ -209,5 +210,4 @@ def test_a_family_of_orbits_tells_how_each_of_them_loses_its_stability(changed, 
     assert not found.stable[-1]
     assert [fold[vary] for fold in found.folds] == pytest.approx([0.0] * (vary == "push"), abs=1e-8)
     assert "periodic motions of Swaying" in str(found)
-    with pytest.raises(ValueError, match="`critical` needs a family of steady motions"):
-        jj.critical(scene, found, kind)
+    refused("`critical` needs a family of steady motions", jj.critical, scene, found, kind)

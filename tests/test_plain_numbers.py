@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_scenes import BeadOnTurningWire
-from tolerances import tolerance
+from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax.equations import (
@@ -56,7 +56,7 @@ class Slider(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push, angle_rate=1),)
+        return jj.generalized_force(motion, x_rate=motion.inputs.push, angle_rate=1)
 
 
 def _motion():
@@ -167,7 +167,7 @@ def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_
             start.q, start.u
         )
         for value, expected in zip(found, traced, strict=True):
-            np.testing.assert_allclose(value, expected, rtol=tolerance("round_off"), atol=1e-13)
+            np.testing.assert_allclose(value, expected, rtol=ROUND_OFF, atol=1e-13)
 
 
 def test_samples_in_single_precision_are_those_in_double():

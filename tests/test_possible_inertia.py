@@ -61,7 +61,7 @@ class Turning(jj.Scene):
         return {"body": jj.RigidBody(1.0, self.inertia(), jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_y(q.pitch))}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, yaw_rate=-2.0 * motion.q.yaw, pitch_rate=-3.0 * motion.q.pitch),)
+        return jj.generalized_force(motion, yaw_rate=-2.0 * motion.q.yaw, pitch_rate=-3.0 * motion.q.pitch)
 
 
 class TurningBody(Turning):

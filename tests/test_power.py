@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 import small_scenes as small
 from timed_scenes import TIMED
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import power
@@ -56,7 +56,7 @@ def test_energy_changes_by_the_power_of_what_has_no_potential(scene):
     rate, supplied, size = eval_numpy(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(
         *states
     )
-    assert jnp.all(jnp.abs(rate - supplied) <= tolerance("round_off") * size)
+    assert jnp.all(jnp.abs(rate - supplied) <= ROUND_OFF * size)
 
 
 def test_the_wire_does_the_work_that_turns_the_bead():
@@ -64,7 +64,7 @@ def test_the_wire_does_the_work_that_turns_the_bead():
     scene = small.BeadOnTurningWire(mass=0.6, rate=1.7)
     t, q, u = jnp.asarray(0.4), jnp.array([0.5]), jnp.array([0.8])
     found = power(scene, jj.motion_at(scene, t, q, u), jj.accelerations(scene, t, q, u))
-    assert jnp.allclose(found.driven, 2 * 0.6 * 0.5 * 0.8 * 1.7**2, rtol=tolerance("round_off"))
+    assert jnp.allclose(found.driven, 2 * 0.6 * 0.5 * 0.8 * 1.7**2, rtol=ROUND_OFF)
     assert found.loads == 0.0
 
 
@@ -102,14 +102,14 @@ def test_energy_is_kinetic_and_potential():
     q, u, _ = scene.named(lean=0.4, lean_rate=1.5)
     found = jj.energy(scene, 0.0, q, u)
     # a tilt about the rim: A + m a^2 with A = m a^2/4; height a cos(lean)
-    assert jnp.allclose(found.kinetic, 0.5 * 1.25 * 2.0 * 0.5**2 * 1.5**2, rtol=tolerance("round_off"))
-    assert jnp.allclose(found.potential, 2.0 * 9.81 * 0.5 * jnp.cos(0.4), rtol=tolerance("round_off"))
+    assert jnp.allclose(found.kinetic, 0.5 * 1.25 * 2.0 * 0.5**2 * 1.5**2, rtol=ROUND_OFF)
+    assert jnp.allclose(found.potential, 2.0 * 9.81 * 0.5 * jnp.cos(0.4), rtol=ROUND_OFF)
     assert found.total == found.kinetic + found.potential
 
 
 def assert_balanced(motion):
     balance, size = motion.energies().balance, jnp.max(jnp.abs(motion.work))
-    assert jnp.ptp(balance) <= tolerance("closed_form") * size
+    assert jnp.ptp(balance) <= CLOSED_FORM * size
 
 
 @pytest.mark.parametrize("case", TIMED, ids=lambda case: type(case[0]).__name__)
@@ -122,7 +122,7 @@ def test_the_work_that_time_does_is_integrated_and_is_that_of_the_closed_form(ca
     inputs = {"speed": 0.6} if scene.inputs.entries else None
     motion = jj.simulate(scene, ts=ts, rtol=1e-12, atol=1e-12, inputs=inputs).raise_if_failed()
     assert motion.energies().kind == "T + V less the work done"
-    assert relative_error(motion.work, scene.work(ts)) <= tolerance("closed_form")
+    assert relative_error(motion.work, scene.work(ts)) <= CLOSED_FORM
     assert_balanced(motion)
 
 

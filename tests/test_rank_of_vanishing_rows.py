@@ -86,7 +86,7 @@ class HangingPlate(jj.Scene):
         return {"plate": jj.RigidBody(2.0, 0.1 * jnp.ones(3), [q.x, 0.0, q.z], jj.rot_y(q.turned))}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def geometric_constraints(self, pose):
         hooks = {

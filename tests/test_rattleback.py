@@ -8,7 +8,7 @@ import pytest
 from agreement import admissible_states
 from numpy.testing import assert_allclose
 from oracles import rattleback as oracle
-from tolerances import relative_error, tolerance
+from tolerances import ROUND_OFF, relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.equations import coordinate_rates
@@ -41,7 +41,7 @@ def test_rates_are_those_of_the_equations_by_hand():
 
     for _, q, u in admissible_states(STONE, 20):
         expected = oracle.rates(np.concatenate([q[2:], u[2:]]), **SHAPE)
-        assert relative_error(rates(q, u), expected.astype(float)) <= tolerance("round_off")
+        assert relative_error(rates(q, u), expected.astype(float)) <= ROUND_OFF
 
 
 def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
@@ -52,8 +52,8 @@ def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
             [0.0, 0.0, oracle.RUN["h"]]
         )  # from the ellipsoid's centre
         normal = point / squares
-        assert abs(point @ normal - 1) <= tolerance("round_off")
-        assert relative_error(normal / np.linalg.norm(normal), down) <= tolerance("round_off")
+        assert abs(point @ normal - 1) <= ROUND_OFF
+        assert relative_error(normal / np.linalg.norm(normal), down) <= ROUND_OFF
 
 
 @pytest.mark.parametrize("time", oracle.TABLE)
@@ -102,7 +102,7 @@ def test_units_do_not_matter():
     in_centimetres = STONE.replace(**{name: factor * getattr(STONE, name) for name, factor in scale.items()})
     level = jnp.array([100.0, 100.0, 1.0, 1.0, 1.0])
     centimetres = jj.accelerations(in_centimetres, 0.0, level * q, level * u).udot
-    assert relative_error(centimetres / level, metres) <= tolerance("round_off")
+    assert relative_error(centimetres / level, metres) <= ROUND_OFF
 
 
 def test_the_normal_force_at_rest_is_the_weight():
@@ -110,4 +110,4 @@ def test_the_normal_force_at_rest_is_the_weight():
     force = jax.jit(
         lambda q, u: jj.newton_residual(STONE, 0.0, q, u, jj.accelerations(STONE, 0.0, q, u).udot).linear[0]
     )(q, u)
-    assert relative_error(force, [0.0, 0.0, float(STONE.mass * STONE.gravity)]) <= tolerance("round_off")
+    assert relative_error(force, [0.0, 0.0, float(STONE.mass * STONE.gravity)]) <= ROUND_OFF

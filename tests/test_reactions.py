@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_scenes as small
-from tolerances import tolerance
+from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax import diagnose
@@ -50,7 +50,7 @@ def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene)
 
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 10)]
     by_body, expected = compare(*states)
-    assert jnp.max(jnp.abs(by_body - expected)) <= tolerance("round_off") * jnp.max(jnp.abs(expected))
+    assert jnp.max(jnp.abs(by_body - expected)) <= ROUND_OFF * jnp.max(jnp.abs(expected))
 
 
 def at_a_state(scene):
@@ -68,10 +68,8 @@ def test_the_forces_of_a_blade_act_sideways_at_the_blade():
         jnp.array([jnp.cos(heading), jnp.sin(heading), 0.0]),
     )
     # the blade is `offset` behind the mass centre: torque = -offset * sideways force
-    assert jnp.abs(force @ forward) <= tolerance("round_off")
-    assert jnp.allclose(
-        torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=tolerance("round_off")
-    )
+    assert jnp.abs(force @ forward) <= ROUND_OFF
+    assert jnp.allclose(torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=ROUND_OFF)
 
 
 def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
@@ -99,13 +97,11 @@ def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_t
     )
     contact = rim(scene, q, u)
     centripetal = 1.4 * 2.0 * 0.7 * 1.5
-    assert jnp.allclose(contact.normal, 1.4 * 9.81, rtol=tolerance("round_off"))
+    assert jnp.allclose(contact.normal, 1.4 * 9.81, rtol=ROUND_OFF)
     assert jnp.allclose(
-        contact.tangential,
-        centripetal * jnp.array([-jnp.sin(0.4), jnp.cos(0.4)]),
-        rtol=tolerance("round_off"),
+        contact.tangential, centripetal * jnp.array([-jnp.sin(0.4), jnp.cos(0.4)]), rtol=ROUND_OFF
     )
-    assert jnp.allclose(contact.friction_needed, centripetal / (1.4 * 9.81), rtol=tolerance("round_off"))
+    assert jnp.allclose(contact.friction_needed, centripetal / (1.4 * 9.81), rtol=ROUND_OFF)
     assert contact.determined
     assert not contact.pulls
 
@@ -132,7 +128,7 @@ def test_a_contact_without_any_load_bears_nothing_and_is_honest(scene):
     motion = jj.simulate(scene, roll, t1=1.0)  # straight on
     found = diagnose(motion).contacts["rim"]
     assert found.honest
-    assert max(abs(found.lowest_normal), abs(found.highest_normal)) <= tolerance("round_off")
+    assert max(abs(found.lowest_normal), abs(found.highest_normal)) <= ROUND_OFF
     assert found.friction_needed == 0.0
     assert not np.any(motion.contact_forces()["rim"].pulls)
     assert "PULL" not in str(motion)
@@ -142,9 +138,7 @@ def test_a_contact_that_presses_nowhere_and_is_pushed_sideways_needs_infinite_fr
     # no gravity, a turn: centripetal force m w_heading R w_roll without a normal force
     scene = VerticalDisc(mass=1.4, radius=0.7, gravity=0.0)
     contact = rim(scene, *scene.named(heading_rate=2.0, roll_rate=1.5, x_rate=1.05)[:2])
-    assert jnp.allclose(
-        contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=tolerance("round_off")
-    )
+    assert jnp.allclose(contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=ROUND_OFF)
     assert jnp.isinf(contact.friction_needed)
     assert not contact.pulls
 

@@ -113,7 +113,7 @@ class WrongPotential(Spring):
 
     def loads(self, motion):
         x = motion.q.x
-        return (jj.Load(generalized={"x_rate": -self.k * x}, potential=self.k * x**2),)
+        return jj.Load(generalized={"x_rate": -self.k * x}, potential=self.k * x**2)
 
 
 WAYS = ({}, {"backend": "xla"}, {"backend": "dense"})
@@ -172,7 +172,7 @@ class Damped(Spring):
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (jj.generalized_force(motion, x_rate=-self.k * q.x - 5.0 * jnp.sqrt(self.k) * u.x_rate),)
+        return jj.generalized_force(motion, x_rate=-self.k * q.x - 5.0 * jnp.sqrt(self.k) * u.x_rate)
 
 
 @pytest.mark.parametrize("k", [1e4, 1e7])

@@ -86,7 +86,7 @@ def sleigh(kind, metre, kilogram, second):
 
         def loads(self, motion):
             torque = 0.1 * kilogram * speed**2 * jnp.sin(motion.q.heading)
-            return (jj.generalized_force(motion, heading_rate=torque),)
+            return jj.generalized_force(motion, heading_rate=torque)
 
     return Sleigh()
 

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from browser import needs_browser, screenshot
 from numpy.testing import assert_allclose
+from refusals import refused
 
 import jourdain_jax as jj
 from jourdain_jax.views.looks import guessed
@@ -31,7 +32,7 @@ class Rolling(jj.Scene):
         return {"ball": jj.RigidBody(2.0, moments, place, jj.rot_y(q.turn))}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def contacts(self, pose):
         return {"table": jj.ball_contact(pose["ball"], self.radius)}
@@ -329,5 +330,4 @@ def test_a_file_without_a_mesh_is_refused(tmp_path):
         "part.xyzw": r"a mesh from `.*part\.xyzw`: .*not supported.*; give a file such as \.stl or \.obj",
         "points.obj": r"`.*points\.obj` has no faces, expected a mesh",
     }.items():
-        with pytest.raises(ValueError, match=said):
-            jj.Visual.from_file(tmp_path / name)
+        refused(said, jj.Visual.from_file, tmp_path / name)

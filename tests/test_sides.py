@@ -31,7 +31,7 @@ class Bead(jj.Scene):
         return {"bead": jj.Particle(1.0, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate)),)
+        return jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate))
 
     def events(self, motion):
         return {} if self.event is None else {"event": self.event(self, motion)}
@@ -175,7 +175,7 @@ class Patch(OnPlane):
 
     def loads(self, motion):
         brakes = 0.0 if self.on is None else -self.on(self, motion.t, motion.q.x, motion.q.y)
-        return (jj.generalized_force(motion, x_rate=brakes + 0 * motion.t),)
+        return jj.generalized_force(motion, x_rate=brakes + 0 * motion.t)
 
     def events(self, motion):
         return (
@@ -306,7 +306,7 @@ class Driven(Bead):
     inputs = jj.inputs("push")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+        return jj.generalized_force(motion, x_rate=motion.inputs.push)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -332,7 +332,7 @@ class Lost(jj.Scene):
         return {"mass": jj.RigidBody(1.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jnp.eye(3))}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 20.0, jnp.nan, -9.81)),)
+        return jj.generalized_force(motion, x_rate=jnp.where(motion.q.x > 20.0, jnp.nan, -9.81))
 
 
 def test_a_start_where_a_load_is_no_number_ends():

@@ -149,7 +149,7 @@ class Trolley(jj.Scene):
         return {"load": jj.Particle(1.0, place), "wheel": wheel}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=1.0),)
+        return jj.generalized_force(motion, x_rate=1.0)
 
     def velocity_constraints(self, motion):
         u = motion.u

@@ -8,12 +8,10 @@ from closed_form_runs import end_error
 from derivatives import derivatives
 from oracles import chaplygin_sleigh, skate
 from solved_states import solved_at_random_states, solved_by_every_reduction
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, Skate
-
-ROUND_OFF = tolerance("round_off")
 
 
 def _skate_accelerations(x):
@@ -74,7 +72,7 @@ def test_the_skate_drifts_across_the_slope_as_by_its_closed_form(moving):
         "y_rate": u * np.sin(th),
         "heading_rate": run["th_rate"],
     }
-    assert end_error(scene, start, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
+    assert end_error(scene, start, skate.motion, run, "x y", heading="th") <= CLOSED_FORM
 
 
 def test_the_sleighs_blade_obeys_the_reduced_equations():
@@ -93,6 +91,7 @@ def test_the_sleigh_turns_round_and_runs_straight(turn):
     run = chaplygin_sleigh.RUN | {"w0": turn}
     scene = ChaplyginSleigh(run["mass"], run["inertia"], run["a"])
     start = {"x_rate": run["v0"], "y_rate": run["a"] * turn, "heading_rate": turn}
-    assert end_error(
-        scene, start, chaplygin_sleigh.motion, run, "x y", heading="th", heading_rate="w"
-    ) <= tolerance("closed_form")
+    assert (
+        end_error(scene, start, chaplygin_sleigh.motion, run, "x y", heading="th", heading_rate="w")
+        <= CLOSED_FORM
+    )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from oracles import snakeboard as oracle
-from tolerances import relative_error, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF, relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.models import Snakeboard
@@ -40,7 +40,7 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
     )  # m, on curls
     for name, key in pairs.items():
         size = travelled if name in ("x", "y") else None
-        assert relative_error(motion[name], expected[key], size) <= tolerance("closed_form"), name
+        assert relative_error(motion[name], expected[key], size) <= CLOSED_FORM, name
 
 
 def test_a_retry_passes_wherever_a_step_ends_near_the_loss_of_rank():
@@ -80,12 +80,12 @@ def test_a_torque_on_the_rotor_turns_the_board_the_other_way():
     q, u, _ = BOARD.named(steer=jnp.pi / 2)
     udot = BOARD.speed_names.view(jj.accelerations(BOARD, 0.0, q, u, jnp.array([0.3, 0.0])).udot)
     board = BOARD.board_inertia + 2 * BOARD.wheel_inertia
-    assert relative_error(udot.heading_rate, -0.3 / board) <= tolerance("round_off")
-    assert relative_error(udot.rotor_rate, 0.3 / board + 0.3 / BOARD.rotor_inertia) <= tolerance("round_off")
+    assert relative_error(udot.heading_rate, -0.3 / board) <= ROUND_OFF
+    assert relative_error(udot.rotor_rate, 0.3 / board + 0.3 / BOARD.rotor_inertia) <= ROUND_OFF
 
 
 def test_a_torque_on_the_wheels_opens_both_pairs():
     q, u, _ = BOARD.named(steer=0.4)
     udot = BOARD.speed_names.view(jj.accelerations(BOARD, 0.0, q, u, jnp.array([0.0, 0.3])).udot)
-    assert relative_error(udot.steer_rate, 0.3 / (2 * BOARD.wheel_inertia)) <= tolerance("round_off")
-    assert abs(udot.heading_rate) <= tolerance("round_off")
+    assert relative_error(udot.steer_rate, 0.3 / (2 * BOARD.wheel_inertia)) <= ROUND_OFF
+    assert abs(udot.heading_rate) <= ROUND_OFF

@@ -110,10 +110,8 @@ class Sprung(OnLine):
     inputs = jj.inputs("push")
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3
-            ),
+        return jj.generalized_force(
+            motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3
         )
 
 

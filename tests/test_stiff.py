@@ -27,10 +27,8 @@ class Damped(OnLine):
     rate: object = jj.parameter(1e7, positive=True)
 
     def loads(self, motion):
-        return (
-            jj.generalized_force(
-                motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)
-            ),
+        return jj.generalized_force(
+            motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)
         )
 
 
@@ -65,7 +63,7 @@ class Drawn(OnALine):
     """
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-9.81 + self.strength * jnp.sqrt(motion.q.x + 0.02)),)
+        return jj.generalized_force(motion, x_rate=-9.81 + self.strength * jnp.sqrt(motion.q.x + 0.02))
 
     def events(self, motion):
         return {"floor": motion.q.x}
@@ -227,12 +225,8 @@ class Following(OnPlane):
 
     def loads(self, motion):
         q, u = motion.q, motion.u
-        return (
-            jj.generalized_force(
-                motion,
-                x_rate=-self.rate * (q.x - jnp.sin(q.y)) - self.rate * u.x_rate,
-                y_rate=-1.0 + 0.0 * q.x,
-            ),
+        return jj.generalized_force(
+            motion, x_rate=-self.rate * (q.x - jnp.sin(q.y)) - self.rate * u.x_rate, y_rate=-1.0 + 0.0 * q.x
         )
 
     def events(self, motion):

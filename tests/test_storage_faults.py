@@ -27,7 +27,7 @@ class Belt(OnBelt):
     sides: int = eqx.field(static=True, default=2)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, y_rate=motion.inputs.push - self.drag * motion.u.y_rate),)
+        return jj.generalized_force(motion, y_rate=motion.inputs.push - self.drag * motion.u.y_rate)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from small_scenes import Bead
 
 import jourdain_jax as jj
@@ -32,11 +33,9 @@ class Spring(jj.Scene):
         return {"bead": jj.Particle(self.mass, (q.x, q.y, 0))}
 
     def loads(self, motion):
-        return (
-            jj.point_force(
-                motion["bead"].point(),
-                -self.stiffness * jnp.eye(3, dtype=jnp.float32) @ jnp.stack([motion.q.x, motion.q.y, 0.0]),
-            ),
+        return jj.point_force(
+            motion["bead"].point(),
+            -self.stiffness * jnp.eye(3, dtype=jnp.float32) @ jnp.stack([motion.q.x, motion.q.y, 0.0]),
         )
 
     def velocity_constraints(self, motion):
@@ -101,8 +100,12 @@ def test_numbers_of_extended_precision_are_rounded_and_complex_ones_named():
         scene.stiffness.dtype == np.float64
         for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble)))
     )
-    with pytest.raises(ValueError, match="`ts` of `Sampled` is of type complex256, expected real numbers"):
-        jj.Sampled(wide.astype(np.clongdouble), wide)
+    refused(
+        "`ts` of `Sampled` is of type complex256, expected real numbers",
+        jj.Sampled,
+        wide.astype(np.clongdouble),
+        wide,
+    )
 
 
 SKATE = jj.models.Skate()
@@ -153,7 +156,7 @@ class Slider(Bead):
     """A bead on a plane whose load has a mistake."""
 
     def loads(self, motion):
-        return (jj.point_force(motion["bead"].point(), self.pull(motion)),)
+        return jj.point_force(motion["bead"].point(), self.pull(motion))
 
 
 class WrongShapes(Slider):

@@ -14,7 +14,7 @@ from long_runs_scenes import ContactOscillator, GaugeTwin
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import chaplygin_sleigh, skate
 from small_scenes import DrivenPendulum, Oscillator
-from tolerances import tolerance
+from tolerances import ROUND_OFF, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
@@ -63,7 +63,7 @@ def test_discrete_forces_and_prescribed_coordinates_are_of_second_order_too():
     for part in ("q_end", "u_end", "work"):
         errors = [np.max(np.abs(getattr(end, part) - getattr(exact, part))) for end in ends]
         assert 1.9 < order(errors) < 2.1, part
-    assert_allclose(ends[-1].q_end[0], 0.3 * np.sin(2.0), atol=tolerance("round_off"))  # the prescribed pivot
+    assert_allclose(ends[-1].q_end[0], 0.3 * np.sin(2.0), atol=ROUND_OFF)  # the prescribed pivot
 
 
 def test_rows_that_depend_on_each_other_are_left_out():
@@ -111,20 +111,20 @@ def test_steps_back_undo_the_steps_forth(solver):
     there = run(twin, start, solver, t1=4.0, step=0.2)
     back = run(twin, there.end, solver, t0=4.0, t1=0.0, step=0.2)
     assert np.max(np.abs(there.q_end - start.q)) > 0.1
-    assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
-    assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
+    assert_allclose(back.q_end, start.q, rtol=0, atol=ROUND_OFF)
+    assert_allclose(back.u_end, start.u, rtol=0, atol=ROUND_OFF)
 
 
 def test_the_discrete_gradient_keeps_the_energy():
     oscillator = ContactOscillator()
-    assert change(oscillator, GRADIENT, energy_of(oscillator), 0.2) < tolerance("round_off")
+    assert change(oscillator, GRADIENT, energy_of(oscillator), 0.2) < ROUND_OFF
     assert 1e-6 < change(oscillator, GRADIENT, driver, 0.2) < 0.1  # which it does not keep
 
 
 @pytest.mark.parametrize("solver", [MIDPOINT, DLA], ids=named)
 def test_midpoint_rules_keep_a_quadratic_integral(solver):
     oscillator = ContactOscillator()
-    assert change(oscillator, solver, driver, 0.2) < tolerance("round_off")
+    assert change(oscillator, solver, driver, 0.2) < ROUND_OFF
     assert 1e-6 < change(oscillator, solver, energy_of(oscillator), 0.2) < 0.1  # which they do not keep
 
 
@@ -141,8 +141,8 @@ def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
 def test_geometric_rows_hold_at_every_node():
     rods = MODELS["double-pendulum-rods"]()
     motion = run(rods, jj.start(rods, **rods.example), DLA, t1=1.0, step=0.02)
-    assert jnp.max(jnp.abs(motion.residuals()[0])) < tolerance("round_off")
-    assert jnp.max(jnp.abs(motion.residuals()[1])) < tolerance("round_off")
+    assert jnp.max(jnp.abs(motion.residuals()[0])) < ROUND_OFF
+    assert jnp.max(jnp.abs(motion.residuals()[1])) < ROUND_OFF
 
 
 # Derivatives and batches. -----------------------------------------------------------------------------------
@@ -178,7 +178,7 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
     assert not np.isfinite(rolled.lanes.q[3, -1]).any()
     assert np.isfinite(rolled.lanes.q_end).all()
     alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, **start), DLA, t1=4.0, step=0.2)
-    assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
+    assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=ROUND_OFF)
 
 
 # Steps, time and errors. ------------------------------------------------------------------------------------

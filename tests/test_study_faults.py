@@ -26,6 +26,7 @@ import numpy as np
 import psutil
 import pytest
 from jax.flatten_util import ravel_pytree
+from refusals import refused
 from scipy.interpolate import CubicSpline
 from test_inputs import OnBelt
 from test_studies import assert_same
@@ -170,8 +171,7 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
     assert not any(share.complete for share in shares)
     assert "run it again" in str(shares[0])
     assert shares[3].counts == {}
-    with pytest.raises(ValueError, match="not a share"):
-        merge_studies(paths[0], [run(tmp_path / "other.zarr", seed=4).store.path])
+    refused("not a share", merge_studies, paths[0], [run(tmp_path / "other.zarr", seed=4).store.path])
     assert_same(merge_studies(paths[3], paths[:3]), whole)
 
 
@@ -193,12 +193,15 @@ def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tm
 )
 def test_a_study_that_its_disk_cannot_hold_is_refused_before_it_begins(samples, options, tmp_path):
     many = jj.Study(jj.models.TiltingDisc(), start={"lean": Uniform(-0.5, 0.5)}, samples=samples)
-    with pytest.raises(
-        ValueError, match=r"the results take [\d,.]+ GB, and the disk of `.*discs.zarr` has [\d,.]+ GB"
-    ):
-        many.run(
-            tmp_path / "new" / "discs.zarr", t1=1.0, ts=np.linspace(0.0, 1.0, 200), progress=False, **options
-        )
+    refused(
+        r"the results take [\d,.]+ GB, and the disk of `.*discs.zarr` has [\d,.]+ GB",
+        many.run,
+        tmp_path / "new" / "discs.zarr",
+        t1=1.0,
+        ts=np.linspace(0.0, 1.0, 200),
+        progress=False,
+        **options,
+    )
     assert not os.listdir(tmp_path)
 
 
@@ -261,26 +264,21 @@ def test_an_option_is_not_named_for_the_place_of_a_function_in_memory(tmp_path):
         )
 
     study()
-    with pytest.raises(ValueError, match=r"with different options \(`rtol`\); give"):
-        study(rtol=1e-6)
+    refused(r"with different options \(`rtol`\); give", study, rtol=1e-6)
 
 
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     folder = tmp_path / "letters"
     folder.mkdir()
     (folder / "one.txt").write_text("Dear")
-    with pytest.raises(ValueError, match="is not a study"):
-        run(folder)
-    with pytest.raises(ValueError, match="is a file"):
-        run(folder / "one.txt")
+    refused("is not a study", run, folder)
+    refused("is a file", run, folder / "one.txt")
     assert [file.name for file in folder.iterdir()] == ["one.txt"]
-    with pytest.raises(ValueError, match="does not exist"):
-        jj.load_study(tmp_path / "nothing")
+    refused("does not exist", jj.load_study, tmp_path / "nothing")
 
 
 def test_other_chunks_than_the_study_began_with_are_refused(whole):
-    with pytest.raises(ValueError, match="begun with chunks of 32 samples"):
-        run(whole.store.path, chunk=64)
+    refused("begun with chunks of 32 samples", run, whole.store.path, chunk=64)
 
 
 @pytest.mark.skipif(records.fcntl is None, reason="no locks on this system")
@@ -306,15 +304,12 @@ def _changed(path, name, **entries):
 def test_another_format_is_refused(path):
     _changed(path, "study.json", format=3)
     for read in (run, jj.load_study):
-        with pytest.raises(
-            ValueError,
-            match="has format 3, this version of jourdain-jax reads 2; use the version that wrote it",
-        ):
-            read(path)
+        refused(
+            "has format 3, this version of jourdain-jax reads 2; use the version that wrote it", read, path
+        )
     (path / "run" / "manifest.json").unlink()  # as the first format, which had none
     (path / "run" / "study.json").write_text(json.dumps({"format": 1}))
-    with pytest.raises(ValueError, match="has format 1, this version of jourdain-jax reads 2"):
-        jj.load_study(path)
+    refused("has format 1, this version of jourdain-jax reads 2", jj.load_study, path)
 
 
 def test_numbers_of_a_study_are_within_their_ranges(whole, path):
@@ -322,12 +317,10 @@ def test_numbers_of_a_study_are_within_their_ranges(whole, path):
         for value in (10**18, 10**30, 1e18, 0, -1, 90.0, True, "90", None, [90]):
             _changed(path, "study.json", **{entry: value})
             said = rf"study.json` is damaged \(`{entry}` is .*, expected a whole number from 1 to"
-            with pytest.raises(ValueError, match=said):
-                jj.load_study(path)
+            refused(said, jj.load_study, path)
         _changed(path, "study.json", **{entry: whole.store.study[entry]})
     _changed(path, "study.json", samples=2**52)
-    with pytest.raises(ValueError, match="samples are more than 16777216 chunks of 32"):
-        jj.load_study(path)
+    refused("samples are more than 16777216 chunks of 32", jj.load_study, path)
 
 
 def test_numbers_of_a_grid_are_within_their_ranges(whole, path):
@@ -395,8 +388,7 @@ def test_a_folder_that_is_moved_while_a_study_runs_is_named(tmp_path, monkeypatc
         patch.setattr(
             Store, "write_grid", lambda self, grid: path.rename(tmp_path / "moved.zarr") and Store(path)
         )
-        with pytest.raises(ValueError, match="does not exist"):
-            run(path)
+        refused("does not exist", run, path)
 
 
 # Every file of a folder, changed in every way that is tried: the right answer, or a named error or warning. -
@@ -660,10 +652,14 @@ def test_what_a_function_reads_of_a_module_of_the_user_counts(monkeypatch):
 
 
 def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):
-    with pytest.raises(ValueError, match="at the top level of a module"):
-        run(tmp_path / "discs.zarr", outputs={"lean": lambda motion: motion.q_end[3]}, processes=2)
-    with pytest.raises(ValueError, match="`processes` is 0"):
-        run(tmp_path / "discs.zarr", processes=0)
+    refused(
+        "at the top level of a module",
+        run,
+        tmp_path / "discs.zarr",
+        outputs={"lean": lambda motion: motion.q_end[3]},
+        processes=2,
+    )
+    refused("`processes` is 0", run, tmp_path / "discs.zarr", processes=0)
 
 
 # Other processes. -------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from test_study_faults import run, study
 
 import jourdain_jax as jj
@@ -36,10 +37,12 @@ def test_an_amount_is_read(text, count):
     "wrong", ["much", "2 XB", "-1GB", True, "nan GB", float("inf"), float("nan"), "0.GBs"]
 )
 def test_what_is_no_amount_is_refused(wrong):
-    with pytest.raises(
-        ValueError, match=r"`memory` is .*, expected a number of bytes, or a text such as '2GB'"
-    ):
-        jj.build(jj.models.TiltingDisc(), memory=wrong)
+    refused(
+        r"`memory` is .*, expected a number of bytes, or a text such as '2GB'",
+        jj.build,
+        jj.models.TiltingDisc(),
+        memory=wrong,
+    )
 
 
 def bounded(monkeypatch, room):
@@ -73,8 +76,13 @@ def test_a_study_goes_on_with_the_blocks_with_which_it_began(tmp_path, monkeypat
     assert begun.complete
     assert begun.store.study["block"] == 16
     assert_array_equal(begun.statistics.mean, whole.statistics.mean)
-    with pytest.raises(ValueError, match="blocks of 16 samples and chunks of 16 take up to"):
-        run(path, memory=bounded(monkeypatch, 1000), **TIMES)
+    refused(
+        "blocks of 16 samples and chunks of 16 take up to",
+        run,
+        path,
+        memory=bounded(monkeypatch, 1000),
+        **TIMES,
+    )
 
 
 def test_a_rollout_runs_fewer_lanes_at_once_where_its_model_has_little_memory(capsys):
@@ -88,12 +96,19 @@ def test_a_rollout_runs_fewer_lanes_at_once_where_its_model_has_little_memory(ca
 
 
 def test_too_little_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(
-        ValueError, match="`memory` allows 100 MB for each computing process, but this process uses"
-    ):
-        run(tmp_path / "discs.zarr", memory="100MB")
-    with pytest.raises(ValueError, match="a new process uses 240 MB before the study begins"):
-        run(tmp_path / "discs.zarr", memory="1GB", processes=4)
+    refused(
+        "`memory` allows 100 MB for each computing process, but this process uses",
+        run,
+        tmp_path / "discs.zarr",
+        memory="100MB",
+    )
+    refused(
+        "a new process uses 240 MB before the study begins",
+        run,
+        tmp_path / "discs.zarr",
+        memory="1GB",
+        processes=4,
+    )
     assert not (tmp_path / "discs.zarr").exists()
 
 
@@ -113,8 +128,7 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
 
 def test_systems_that_do_not_say_refuse(tmp_path, monkeypatch):
     monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
-    with pytest.raises(ValueError, match="limited only on Linux with glibc"):
-        run(tmp_path / "discs.zarr", memory="4GB")
+    refused("limited only on Linux with glibc", run, tmp_path / "discs.zarr", memory="4GB")
 
 
 def test_lanes_are_counted_on_the_device_where_they_lie(tmp_path, monkeypatch):

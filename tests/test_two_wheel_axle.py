@@ -11,7 +11,7 @@ from closed_form_runs import end_error
 from derivatives import derivatives
 from oracles import two_wheel_axle
 from solved_states import solved_at_random_states
-from tolerances import relative_error, tolerance
+from tolerances import ROUND_OFF, relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations import constraint_rows
@@ -22,7 +22,6 @@ from jourdain_jax.models import (
     TwoWheelAxleRedundant,
 )
 
-ROUND_OFF = tolerance("round_off")
 PARAMETERS = {"radius": 0.27, "length": 0.9, "mass": 1.7, "rim_mass": 0.4, "slope": 0.35}
 # Method -> names of the heading, of psidot_1 and of phidot.
 NAMES = {

@@ -207,7 +207,7 @@ def test_what_is_wrong_is_found_where_it_is(what):
 def test_without_an_example_a_scene_is_checked_in_motion():
     class Slider(OnLine):
         def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=BRAKE(motion.u.x_rate)),)
+            return jj.generalized_force(motion, x_rate=BRAKE(motion.u.x_rate))
 
     refused(jj.verify(Slider()), "derivatives", "its force on `x_rate`")
 

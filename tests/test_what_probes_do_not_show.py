@@ -35,10 +35,8 @@ class Fading(OnPlane):
     def loads(self, motion):
         force = lambda x: -looked_up(x)
         x = motion.q.x
-        return (
-            jj.generalized_force(
-                motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))
-            ),
+        return jj.generalized_force(
+            motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))
         )
 
 
@@ -55,12 +53,10 @@ class Filtered(OnPlane):
             lambda v: jnp.max(v) > 0.1, lambda v: 0.5 * v, values
         ).sum()
         common = 2.0 + jnp.sin(filtered(motion.u.x_rate)[3])
-        return (
-            jj.generalized_force(
-                motion,
-                x_rate=-halved(common * filtered(motion.q.x)),
-                y_rate=-halved(common * filtered(motion.q.y)),
-            ),
+        return jj.generalized_force(
+            motion,
+            x_rate=-halved(common * filtered(motion.q.x)),
+            y_rate=-halved(common * filtered(motion.q.y)),
         )
 
 
@@ -78,7 +74,7 @@ class Pushed(OnPlane):
     size: object = jj.parameter(1e-10)
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.push(motion, self.size)),)
+        return jj.generalized_force(motion, x_rate=self.push(motion, self.size))
 
 
 PUSHES = {
@@ -137,7 +133,7 @@ class Small(OnPlane):
 
     def loads(self, motion):
         force = lambda table: self.scale * looked_up(motion.q.x, table)
-        return (jj.generalized_force(motion, x_rate=force(self.table), y_rate=force(-self.table)),)
+        return jj.generalized_force(motion, x_rate=force(self.table), y_rate=force(-self.table))
 
 
 def test_operands_are_compared_relative_to_their_size():
@@ -164,7 +160,7 @@ class Sorted(OnPlane):
     def loads(self, motion):
         order = jnp.argsort(self.table)
         factor = jnp.sin(jnp.interp(motion.q.x, jnp.linspace(-3.0, 3.0, 9), self.table**2))
-        return (jj.generalized_force(motion, x_rate=jnp.take(self.table * factor, order) @ jnp.arange(9.0)),)
+        return jj.generalized_force(motion, x_rate=jnp.take(self.table * factor, order) @ jnp.arange(9.0))
 
 
 def test_every_call_says_why_it_is_one():
@@ -216,7 +212,7 @@ class LateStiffness(OnPlane):
 
     def loads(self, motion):
         stiffness = 1.0 + 0.5 * jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 2, 0.0)
-        return (jj.spring(motion["mass"].point(), jj.fixed_point(jnp.zeros(3)), stiffness, 0.5),)
+        return jj.spring(motion["mass"].point(), jj.fixed_point(jnp.zeros(3)), stiffness, 0.5)
 
 
 class LateMass(OnPlane):
@@ -226,7 +222,7 @@ class LateMass(OnPlane):
         return {"particle": jj.Particle(1.0 + jnp.maximum(t - 2.0, 0.0) ** 3, [q.x, q.y, 0.0])}
 
     def loads(self, motion):
-        return (jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), 1.0, 0.5),)
+        return jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), 1.0, 0.5)
 
 
 class LateLift(jj.Scene):
@@ -267,7 +263,7 @@ class FastRow(OnPlane):
         return {"lift": motion.u.y_rate - jnp.where(v > 3.0, (v - 3.0) ** 2, 0.0)}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=1.0, y_rate=-0.5),)
+        return jj.generalized_force(motion, x_rate=1.0, y_rate=-0.5)
 
 
 def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
@@ -286,7 +282,7 @@ class Terrain(OnPlane):
         return {"ground": motion.u.y_rate - slope * motion.u.x_rate}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-jnp.maximum(motion.q.x, 0.0)),)
+        return jj.generalized_force(motion, x_rate=-jnp.maximum(motion.q.x, 0.0))
 
 
 def test_branches_of_coordinates_alone_leave_rows_linear_and_scleronomic():

@@ -8,7 +8,8 @@ import disc_body
 import numpy as np
 import pytest
 from oracles import chaplygin_sleigh
-from tolerances import tolerance
+from refusals import refused
+from tolerances import CLOSED_FORM, ROUND_OFF, tolerance
 
 pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
 from work_precision_cases import curve, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record
@@ -31,8 +32,8 @@ def _constant(y):
 
 def test_the_error_of_the_sleigh_is_its_distance_from_the_closed_form():
     q, u = _exact_sleigh()
-    assert SLEIGH.error(q, u) <= tolerance("closed_form")
-    assert abs(SLEIGH.error(q + np.array([0.0, 0.0, 3e-4]), u) - 3e-4) <= tolerance("closed_form")
+    assert SLEIGH.error(q, u) <= CLOSED_FORM
+    assert abs(SLEIGH.error(q + np.array([0.0, 0.0, 3e-4]), u) - 3e-4) <= CLOSED_FORM
     assert np.isnan(SLEIGH.error(q * np.nan, u))
 
 
@@ -49,7 +50,7 @@ def test_a_curve_gives_records_of_one_format():
     (entry,), ready = measure.points(SLEIGH, exact, lambda text: None)
     assert tuple(entry) == record.KEYS
     assert entry == json.loads(json.dumps(entry))
-    assert entry["error"] <= tolerance("closed_form")
+    assert entry["error"] <= CLOSED_FORM
     assert entry["seconds"] > 0
     assert entry["versions"]["python"]
     assert ready is not None
@@ -68,8 +69,7 @@ def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
 
 
 def test_a_record_of_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="`kind` is 'theirs'"):
-        record.record(**dict.fromkeys(record.KEYS) | {"kind": "theirs"})
+    refused("`kind` is 'theirs'", record.record, **dict.fromkeys(record.KEYS) | {"kind": "theirs"})
 
 
 @pytest.mark.parametrize(
@@ -97,8 +97,8 @@ def test_a_free_body_is_read_as_the_disc_that_it_is():
     # and spin
     radius = float(DISC.scene.radius)
     q, u = disc_body.state(radius, disc_body.start(radius, DISC.minimal_start), {"yaw": 0.0, "spin": 0.0})
-    assert np.max(np.abs(q - DISC.state.q)) <= tolerance("round_off")
-    assert np.max(np.abs(u - DISC.state.u)) <= tolerance("round_off")
+    assert np.max(np.abs(q - DISC.state.q)) <= ROUND_OFF
+    assert np.max(np.abs(u - DISC.state.u)) <= ROUND_OFF
 
 
 def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
@@ -125,7 +125,7 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
         a * w**2,
         -a / k_squared * v * w,
     ]
-    assert np.max(np.abs(rates(0.0, y) - expected)) <= tolerance("round_off")
+    assert np.max(np.abs(rates(0.0, y) - expected)) <= ROUND_OFF
 
 
 def test_times_are_those_of_warm_runs():

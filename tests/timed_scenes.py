@@ -39,7 +39,7 @@ class ShakenAnchor(Bead):
 
     def loads(self, motion):
         anchor = jj.fixed_point(along_x(self.amplitude * jnp.sin(self.rate * motion.t)))
-        return (jj.spring(motion["mass"].point(), anchor, self.stiffness),)
+        return jj.spring(motion["mass"].point(), anchor, self.stiffness)
 
     def work(self, t):
         a, W, w = self.amplitude, self.rate, jnp.sqrt(self.stiffness / self.mass)
@@ -111,7 +111,7 @@ class Lifted(Upright):
     example = {"z": 2.0, "x_rate": 1.0}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def prescribed(self, t):
         return {"z": 2.0 + self.rate * t}
@@ -129,7 +129,7 @@ class Towed(Bead):
     inputs = jj.inputs("speed")
 
     def loads(self, motion):
-        return (jj.spring(motion["mass"].point(), jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness),)
+        return jj.spring(motion["mass"].point(), jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness)
 
     def velocity_constraints(self, motion):
         return {"tow": motion.u.x_rate - motion.inputs.speed}
