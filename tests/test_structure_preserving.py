@@ -45,7 +45,7 @@ def order(errors):
 @pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
 def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
     data = chaplygin_sleigh.RUN | {"t_end": 4.0}
-    exact = chaplygin_sleigh.motion(np.linspace(0.0, 4.0, 5), x0=0.0, y0=0.0, **data)
+    exact = chaplygin_sleigh.motion(np.linspace(0.0, 4.0, 5), **data)
     right = np.array([exact[name][-1] for name in ("x", "y", "th")])
     sleigh = MODELS["chaplygin-sleigh"](mass=data["mass"], inertia=data["inertia"], offset=data["a"])
     start = jj.start(sleigh, x_rate=data["v0"], heading_rate=data["w0"])

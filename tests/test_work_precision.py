@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from oracles import chaplygin_sleigh
 from refusals import refused
-from tolerances import CLOSED_FORM, ROUND_OFF, tolerance
+from tolerances import CLOSED_FORM, ROUND_OFF
 
 pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
 from work_precision_cases import curve, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record
@@ -106,9 +106,7 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
         pytest.skip(peer_sympy.MISSING)
     equations = peer_sympy.kane.SCENES["chaplygin-sleigh"](SLEIGH.scene)
     minimal = SLEIGH.minimal_start
-    assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= tolerance(
-        "round_off"
-    )
+    assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= ROUND_OFF
     try:
         library = peer_sympy.compiled(peer_sympy.c_source(equations))
     except curve.NotApplicable as reason:

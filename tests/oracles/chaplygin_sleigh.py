@@ -3,7 +3,7 @@
 (x, y) is the mass centre, a ahead of the blade; heading th; row -s xdot + c ydot - a thdot = 0. v is the
 forward speed of the blade, w = thdot. v' = a w^2, w' = -(a/k^2) v w, k^2 = inertia/mass + a^2; v = V tanh
 tau, w = +-(V/k) sech tau,
-tau = tau0 + a V t / k^2, th = th0 +- (k/a)(gd tau - gd tau0). The path is a quadrature.
+tau = tau0 + a V t / k^2, th = +-(k/a)(gd tau - gd tau0). The path is a quadrature.
 """
 
 import numpy as np
@@ -17,11 +17,11 @@ def _gudermannian(x):
     return 2 * np.arctan(np.tanh(x / 2))
 
 
-def velocities(t, *, mass, inertia, a, v0, w0, th0=0.0, t_end=None) -> dict[str, np.ndarray]:
+def velocities(t, *, mass, inertia, a, v0, w0, t_end=None) -> dict[str, np.ndarray]:
     """v, w, th in closed form at any times (a may not be zero)."""
     t = np.asarray(t, float)
     if w0 == 0.0:
-        return {"v": v0 + 0 * t, "w": 0 * t, "th": th0 + 0 * t}
+        return {"v": v0 + 0 * t, "w": 0 * t, "th": 0 * t}
     k = np.sqrt(inertia / mass + a**2)
     speed, sign = np.hypot(v0, k * w0), np.sign(w0)
     tau0 = np.arcsinh(v0 / (k * abs(w0)))
@@ -29,13 +29,13 @@ def velocities(t, *, mass, inertia, a, v0, w0, th0=0.0, t_end=None) -> dict[str,
     return {
         "v": speed * np.tanh(tau),
         "w": sign * speed / k / np.cosh(tau),
-        "th": th0 + sign * (k / a) * (_gudermannian(tau) - _gudermannian(tau0)),
+        "th": sign * (k / a) * (_gudermannian(tau) - _gudermannian(tau0)),
     }
 
 
-def motion(t, *, x0=0.0, y0=0.0, **parameters) -> dict[str, np.ndarray]:
-    """v, w, th, x, y (mass centre, from x0, y0) and blade_x, blade_y; t[0] is the time of the start, 0."""
-    a, th0 = parameters["a"], parameters.get("th0", 0.0)
+def motion(t, **parameters) -> dict[str, np.ndarray]:
+    """v, w, th, x, y (mass centre, from zero); t[0] is the time of the start, 0."""
+    a = parameters["a"]
     result = velocities(t, **parameters)
 
     def component(function):
@@ -45,7 +45,6 @@ def motion(t, *, x0=0.0, y0=0.0, **parameters) -> dict[str, np.ndarray]:
 
         return integral(rate, t)
 
-    blade_x = x0 - a * np.cos(th0) + component(np.cos)
-    blade_y = y0 - a * np.sin(th0) + component(np.sin)
-    x, y = blade_x + a * np.cos(result["th"]), blade_y + a * np.sin(result["th"])
-    return {**result, "x": x, "y": y, "blade_x": blade_x, "blade_y": blade_y}
+    # of the blade, which starts at -a
+    x = component(np.cos) + a * (np.cos(result["th"]) - 1)
+    return {**result, "x": x, "y": component(np.sin) + a * np.sin(result["th"])}

@@ -2,7 +2,7 @@
 section 37.
 
 w: body components, I_k w_k' = (I_l - I_m) w_l w_m cyclically; three different principal moments in any order;
-not on the separatrix (|L|^2 = 2 E I_middle) itself, except for the steady turn about the middle axis.
+not on the separatrix (|L|^2 = 2 E I_middle) itself.
 """
 
 import numpy as np
@@ -20,8 +20,6 @@ def _parity(order) -> int:
 def motion(t, *, inertia, w0, t_end=None) -> np.ndarray:
     """Body angular velocity (times, 3)."""
     t = np.asarray(t, float)
-    if np.count_nonzero(w0) == 1:  # about a principal axis, the middle one too
-        return np.broadcast_to(np.asarray(w0, float), (*t.shape, 3)).copy()
     moments, start = np.asarray(inertia, float), np.asarray(w0, float)
     energy, momentum = np.sum(moments * start**2), np.sum((moments * start) ** 2)  # 2E, |L|^2
     order = np.argsort(moments)
@@ -45,8 +43,10 @@ def motion(t, *, inertia, w0, t_end=None) -> np.ndarray:
     return result
 
 
-def attitude(t, *, inertia, w0, quaternion0=(1.0, 0.0, 0.0, 0.0), t_end=None) -> np.ndarray:
-    """Quaternion (w, x, y, z), body to space, (times, 4), integrated in extended precision from t[0]."""
+def attitude(t, *, inertia, w0, t_end=None) -> np.ndarray:
+    """Quaternion (w, x, y, z), body to space, (times, 4), integrated in extended precision from the identity
+    at t[0].
+    """
     i1, i2, i3 = inertia
 
     def rhs(_, state):
@@ -61,7 +61,7 @@ def attitude(t, *, inertia, w0, quaternion0=(1.0, 0.0, 0.0, 0.0), t_end=None) ->
             (i1 - i2) / i3 * a * b,
         ]
 
-    return integrate(rhs, [*quaternion0, *w0], t)[:, :4]
+    return integrate(rhs, [1, 0, 0, 0, *w0], t)[:, :4]
 
 
 def rotation(quaternion) -> np.ndarray:

@@ -11,10 +11,8 @@ import numpy as np
 RUN = {"speed": 1.7, "gravity": 9.81, "theta0": 0.0, "t_end": 2.0}
 
 
-def motion(t, *, speed, gravity, theta0=0.0, x0=0.0, y0=0.0, t_end=None) -> dict[str, np.ndarray]:
-    """x, y, vx, vy, theta, and `force`: constraint force per mass along the velocity (negative brakes);
-    |theta0| < 90 deg.
-    """
+def motion(t, *, speed, gravity, theta0, **_) -> dict[str, np.ndarray]:
+    """x, y (from zero), vx, vy; |theta0| < 90 deg."""
     t = np.asarray(t, float)
     tau0 = -np.arctanh(np.sin(theta0))
     tau = tau0 + gravity * t / speed
@@ -25,10 +23,8 @@ def motion(t, *, speed, gravity, theta0=0.0, x0=0.0, y0=0.0, t_end=None) -> dict
 
     turned = np.arctan(np.sinh(tau)) - np.arctan(np.sinh(tau0))
     return {
-        "x": x0 + size * turned,
-        "y": y0 - size * (height(tau) - height(tau0)),
+        "x": size * turned,
+        "y": size * (height(tau0) - height(tau)),
         "vx": speed / np.cosh(tau),
         "vy": -speed * np.tanh(tau),
-        "theta": -np.arcsin(np.tanh(tau)),
-        "force": -gravity * np.tanh(tau),
     }

@@ -37,13 +37,13 @@ def _extrapolated_step(rhs: Callable, t, y, width):
     return row[-1], row[-1] - row[-2]
 
 
-def integrate(rhs: Callable, start: Sequence, times: Sequence, first_step: float = 0.05) -> np.ndarray:
+def integrate(rhs: Callable, start: Sequence, times: Sequence) -> np.ndarray:
     """States of y' = rhs(t, y) at `times` (the first is the time of `start`), shape (times, components),
     float64.
 
     `rhs` must keep long double (numpy functions, no float() and no float64 arrays inside).
     """
-    t, y, width = LONG(times[0]), np.asarray(start, LONG), LONG(first_step)
+    t, y, width = LONG(times[0]), np.asarray(start, LONG), LONG(0.05)
     states = [y]
     for goal in times[1:]:
         goal = LONG(goal)
@@ -85,14 +85,14 @@ def solve(matrix, right) -> np.ndarray:
     return x
 
 
-def integral(function: Callable, times: Sequence, panel: float = 0.25) -> np.ndarray:
+def integral(function: Callable, times: Sequence) -> np.ndarray:
     """Integrals of `function` (of an array of times) from times[0] to each of `times`: Gauss-Legendre, 24
     points a panel.
     """
     nodes, weights = np.polynomial.legendre.leggauss(24)
     total, sums = 0.0, [0.0]
     for left, right in pairwise(times):
-        edges = np.linspace(left, right, 1 + max(1, int(np.ceil(abs(right - left) / panel))))
+        edges = np.linspace(left, right, 1 + max(1, int(np.ceil(abs(right - left) / 0.25))))
         half, middle = np.diff(edges) / 2, (edges[1:] + edges[:-1]) / 2
         values = function((middle[:, None] + half[:, None] * nodes).ravel()).reshape(len(half), -1)
         total += float(np.sum(half * (values @ weights)))

@@ -39,15 +39,13 @@ def uniform_inertia(mass: float, radius: float) -> tuple[float, float]:
     return mass * radius**2 / 4, mass * radius**2 / 2
 
 
-def motion(
-    t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=0.0, y0=0.0, inertia=None
-) -> dict[str, np.ndarray]:
-    """theta, psi, phi, w1, w2, w3, contact x, y, centre cx, cy, cz, and energy, integrated at about 1e-16 per
+def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3) -> dict[str, np.ndarray]:
+    """theta, psi, phi, w1, w2, w3, contact x, y (from zero), centre cx, cy, cz, integrated at about 1e-16 per
     step.
 
-    `inertia` is (A, C), the uniform disc's by default. Leaves theta in (0, pi) alone: no flat disc.
+    Leaves theta in (0, pi) alone: no flat disc.
     """
-    a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
+    a_moment, c_moment = uniform_inertia(mass, radius)
     ring = mass * radius**2
 
     def rhs(_, state):
@@ -68,36 +66,17 @@ def motion(
             -radius * spin_rate * np.sin(ps),
         ]
 
-    states = integrate(rhs, [theta, psi, phi, w1, w2, w3, x0, y0], t)
+    states = integrate(rhs, [theta, psi, phi, w1, w2, w3, 0.0, 0.0], t)
     result = dict(zip(("theta", "psi", "phi", "w1", "w2", "w3", "x", "y"), states.T, strict=True))
     th, ps = result["theta"], result["psi"]
     result["cx"] = result["x"] - radius * np.cos(th) * np.sin(ps)
     result["cy"] = result["y"] + radius * np.cos(th) * np.cos(ps)
     result["cz"] = radius * np.sin(th)
-    result["energy"] = (
-        (a_moment + ring) * result["w1"] ** 2
-        + a_moment * result["w2"] ** 2
-        + (c_moment + ring) * result["w3"] ** 2
-    ) / 2 + mass * gravity * result["cz"]
     return result
 
 
 def motion_yaw_lean_spin(
-    t,
-    *,
-    mass,
-    radius,
-    gravity,
-    yaw,
-    lean,
-    spin,
-    yaw_rate,
-    lean_rate,
-    spin_rate,
-    x0=0.0,
-    y0=0.0,
-    inertia=None,
-    t_end=None,
+    t, *, mass, radius, gravity, yaw, lean, spin, yaw_rate, lean_rate, spin_rate, **_
 ) -> dict[str, np.ndarray]:
     """The motion from and in yaw, lean, spin (the last are keys beside those of `motion`)."""
     theta = LONG(np.pi) / 2 + LONG(lean)  # pi/2 of double precision: cos(theta) = -sin(lean) to 6e-17
@@ -112,9 +91,6 @@ def motion_yaw_lean_spin(
         w1=lean_rate,
         w2=yaw_rate * np.cos(LONG(lean)),
         w3=-(spin_rate + yaw_rate * np.sin(LONG(lean))),
-        x0=x0,
-        y0=y0,
-        inertia=inertia,
     )
     return {**result, "yaw": result["psi"], "lean": result["theta"] - np.pi / 2, "spin": -result["phi"]}
 
@@ -127,13 +103,13 @@ def _legendre(nu, x) -> tuple[float, float]:
     return float(mpmath.re(value)), float(mpmath.re(slope))
 
 
-def legendre_constants(theta, w2, w3, *, mass, radius, inertia=None) -> tuple[np.ndarray, np.ndarray]:
+def legendre_constants(theta, w2, w3, *, mass, radius) -> tuple[np.ndarray, np.ndarray]:
     """(c1, c2) of w3 = c1 P_nu(cos theta) + c2 P_nu(-cos theta), w2 = ((C + m a^2)/(m a^2)) dw3/dtheta: two
     integrals.
 
     nu (nu + 1) = -C m a^2 / (A (C + m a^2)). Arrays of one shape in, two arrays of that shape out.
     """
-    a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
+    a_moment, c_moment = uniform_inertia(mass, radius)
     ring = mass * radius**2
     nu = (-1 + mpmath.sqrt(1 - 4 * mpmath.mpf(c_moment * ring) / (a_moment * (c_moment + ring)))) / 2
     ratio = (c_moment + ring) / ring
@@ -147,25 +123,16 @@ def legendre_constants(theta, w2, w3, *, mass, radius, inertia=None) -> tuple[np
     return first, second
 
 
-def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity, inertia=None) -> dict[str, float]:
-    """w2, w3, spin_rate (phidot) of steady rolling, and the signed radii of the circles of the centre and of
-    the contact.
-    """
-    a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
+def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity) -> dict[str, float]:
+    """spin_rate (phidot) of steady rolling."""
+    a_moment, c_moment = uniform_inertia(mass, radius)
     w2 = yaw_rate * np.sin(theta)
     load = mass * gravity * radius * np.cos(theta)
     w3 = (a_moment * w2**2 / np.tan(theta) - load) / ((c_moment + mass * radius**2) * w2)
-    spin_rate = w3 - yaw_rate * np.cos(theta)
-    return {
-        "w2": w2,
-        "w3": w3,
-        "spin_rate": spin_rate,
-        "centre_radius": radius * w3 / yaw_rate,
-        "contact_radius": radius * spin_rate / yaw_rate,
-    }
+    return {"spin_rate": w3 - yaw_rate * np.cos(theta)}
 
 
-def spinning_threshold(*, mass, radius, gravity, inertia=None) -> float:
+def spinning_threshold(*, mass, radius, gravity) -> float:
     """Smallest stable yaw rate of upright spinning on the spot; uniform: sqrt(4g/5a)."""
-    a_moment, _ = uniform_inertia(mass, radius) if inertia is None else inertia
+    a_moment, _ = uniform_inertia(mass, radius)
     return float(np.sqrt(mass * gravity * radius / (a_moment + mass * radius**2)))

@@ -10,7 +10,7 @@ RUN = {"b": 0.8, "c": 1.1, "x0": 0.0, "y0": -1.0, "z0": 0.0, "t_end": 5.0}
 
 
 def motion(t, *, b, c, x0, y0, z0, t_end=None) -> dict[str, np.ndarray]:
-    """x, y, z, xdot, ydot, zdot."""
+    """x, y, z."""
     t = np.asarray(t, float)
     y = y0 + b * t
     root = np.sqrt(1 + y**2)
@@ -19,4 +19,4 @@ def motion(t, *, b, c, x0, y0, z0, t_end=None) -> dict[str, np.ndarray]:
     else:
         x = x0 + (c / b) * (np.arcsinh(y) - np.arcsinh(y0))
         z = z0 + (c / b) * (root - np.sqrt(1 + y0**2))
-    return {"x": x, "y": y, "z": z, "xdot": c / root, "ydot": b + 0 * t, "zdot": y * c / root}
+    return {"x": x, "y": y, "z": z}

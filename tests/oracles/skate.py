@@ -22,9 +22,7 @@ RUN = {
 }
 
 
-def motion(
-    t, *, slope, gravity, u0, th0, th_rate, x0=0.0, y0=0.0, mass=None, inertia=None, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, slope, gravity, u0, th0, th_rate, **_) -> dict[str, np.ndarray]:
     """x, y, th, u; mass and inertia do not matter."""
     path = push_while_turning(t, u0, gravity * np.sin(slope), th0, th_rate)
-    return {"x": x0 + path["x"], "y": y0 + path["y"], "th": path["heading"], "u": path["u"]}
+    return path | {"th": path["heading"]}

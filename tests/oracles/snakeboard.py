@@ -26,18 +26,7 @@ RUN = {
 
 
 def velocities(
-    t,
-    *,
-    mass,
-    half_length,
-    board_inertia,
-    wheel_inertia,
-    phi0,
-    phi_rate,
-    u0,
-    rotor_inertia=None,
-    psi_rate=0.0,
-    t_end=None,
+    t, *, mass, half_length, board_inertia, wheel_inertia, phi0, phi_rate, u0, psi_rate, **_
 ) -> dict[str, np.ndarray]:
     """phi, u (forward speed), th_rate, psi_rate in closed form; keeps long double times."""
     inertia = board_inertia + 2 * wheel_inertia
@@ -57,13 +46,13 @@ def velocities(
     }
 
 
-def motion(t, *, th0=0.0, psi0=0.0, x0=0.0, y0=0.0, **parameters) -> dict[str, np.ndarray]:
-    """The closed forms and th, psi, x, y by quadrature from t[0] = 0."""
+def motion(t, **parameters) -> dict[str, np.ndarray]:
+    """The closed forms and th, psi, x, y by quadrature from zero at t[0] = 0."""
 
     def rhs(time, state):
         rates = velocities(time, **parameters)
         th = state[0]
         return [rates["th_rate"], rates["psi_rate"], rates["u"] * np.cos(th), rates["u"] * np.sin(th)]
 
-    th, psi, x, y = integrate(rhs, [th0, psi0, x0, y0], t).T
+    th, psi, x, y = integrate(rhs, np.zeros(4), t).T
     return {**velocities(np.asarray(t, float), **parameters), "th": th, "psi": psi, "x": x, "y": y}

@@ -27,35 +27,27 @@ RUN = {
 }
 
 
-def newton(
-    t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence = (), anchors: Sequence = ()
-) -> dict[str, np.ndarray]:
-    """Positions `r` and velocities `v` (times, particles, dimensions) and rod `tensions` (times, rods +
-    anchors, > 0 pulls).
+def newton(t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence) -> dict[str, np.ndarray]:
+    """Positions `r` and velocities `v` (times, particles, dimensions) and rod `tensions` (times, rods, > 0
+    pulls).
 
     **Arguments:** `force(t, r, v)` -> (particles, dimensions), long double kept; `rods`, pairs of particle
-    numbers; `anchors`, pairs (particle number, fixed point). The start must fit the rods.
+    numbers. The start must fit the rods.
     """
     start, speed = np.asarray(r0, LONG), np.asarray(v0, LONG)
     shape = start.shape
     inverse = 1 / np.asarray(masses, LONG)
-    bars = len(rods) + len(anchors)
 
     def rod_rows(r, v):
-        """Directions (bars, particles, dimensions) and |d'|^2 per bar."""
-        rows, squares = np.zeros((bars, *shape), LONG), np.zeros(bars, LONG)
+        """Directions (rods, particles, dimensions) and |d'|^2 per rod."""
+        rows, squares = np.zeros((len(rods), *shape), LONG), np.zeros(len(rods), LONG)
         for k, (i, j) in enumerate(rods):
             rows[k, i], rows[k, j] = r[i] - r[j], r[j] - r[i]
             squares[k] = ((v[i] - v[j]) ** 2).sum()
-        for k, (i, point) in enumerate(anchors, len(rods)):
-            rows[k, i] = r[i] - np.asarray(point, LONG)
-            squares[k] = (v[i] ** 2).sum()
         return rows, squares
 
     def accelerations(time, r, v):
         free = np.asarray(force(time, r, v), LONG) * inverse[:, None]
-        if not bars:
-            return free, np.zeros(0, LONG)
         rows, squares = rod_rows(r, v)
         matrix = np.einsum("kpd,p,lpd->kl", rows, inverse, rows)
         multipliers = solve(matrix, -squares - np.einsum("kpd,pd->k", rows, free))
@@ -71,27 +63,22 @@ def newton(
     for time, place, velocity in zip(t, r, v, strict=True):
         multipliers = accelerations(time, place.astype(LONG), velocity.astype(LONG))[1]
         lengths = [np.linalg.norm(place[i] - place[j]) for i, j in rods]
-        lengths += [np.linalg.norm(place[i] - np.asarray(point)) for i, point in anchors]
         tensions.append(-multipliers.astype(float) * np.array(lengths))
     return {"r": r, "v": v, "tensions": np.array(tensions)}
 
 
-def spring(p, q, stiffness, natural_length, relative_velocity=None, damping=0.0):
+def spring(p, q, stiffness, natural_length, relative_velocity, damping):
     """Force on the particle at p from a spring (and damper along it) to q."""
     d = p - q
     length = np.sqrt((d * d).sum())
-    pull = stiffness * (length - natural_length)
-    if relative_velocity is not None:
-        pull = pull + damping * (relative_velocity * d).sum() / length
+    pull = stiffness * (length - natural_length) + damping * (relative_velocity * d).sum() / length
     return -pull * d / length
 
 
 def motion(
     t, *, masses, stiffness, natural_length, damping, gravity, anchor, rods, r0, v0, t_end=None
 ) -> dict[str, np.ndarray]:
-    """The example of RUN: particle 0 on a spring to the anchor, the rods between the particles; with
-    `energy`.
-    """
+    """The example of RUN: particle 0 on a spring to the anchor, the rods between the particles."""
     down = np.zeros(len(anchor), LONG)
     down[1] = -gravity
     fixed = np.asarray(anchor, LONG)
@@ -101,11 +88,4 @@ def motion(
         total[0] += spring(r[0], fixed, stiffness, natural_length, v[0], damping)
         return total
 
-    result = newton(t, masses=masses, force=force, r0=r0, v0=v0, rods=rods)
-    r, v, m = result["r"], result["v"], np.asarray(masses)
-    stretch = np.linalg.norm(r[:, 0] - np.asarray(anchor), axis=-1) - natural_length
-    kinetic = np.einsum("p,tpd,tpd->t", m, v, v) / 2
-    return {
-        **result,
-        "energy": kinetic + gravity * np.einsum("p,tp->t", m, r[..., 1]) + stiffness * stretch**2 / 2,
-    }
+    return newton(t, masses=masses, force=force, r0=r0, v0=v0, rods=rods)

@@ -14,7 +14,7 @@ RUN = {"i11": 1.0, "i22": 2.0, "i33": 1.5, "i13": 0.5, "w1": 0.6, "w2": 0.8, "t_
 
 
 def motion(t, *, i11, i22, i13, w1, w2, i33=None, t_end=None) -> dict[str, np.ndarray]:
-    """w1, w2, w3 (= 0) and the constraint torque about body axis 3."""
+    """w1, w2 and the constraint torque about body axis 3; w3 is zero."""
     t = np.asarray(t)  # long double stays
     if w1 == 0.0:
         rates = {"w1": 0 * t, "w2": w2 + 0 * t}
@@ -27,7 +27,7 @@ def motion(t, *, i11, i22, i13, w1, w2, i33=None, t_end=None) -> dict[str, np.nd
         }
     first, second = rates["w1"], rates["w2"]
     torque = -(i13**2 / i11) * first * second + (i22 - i11) * first * second
-    return {**rates, "w3": 0 * t, "torque": torque}
+    return {**rates, "torque": torque}
 
 
 def attitude(t, **parameters) -> np.ndarray:

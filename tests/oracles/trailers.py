@@ -17,25 +17,17 @@ def steady_radii(radius: float, lengths) -> np.ndarray:
     return np.sqrt(radius**2 - np.cumsum(np.square(lengths)))
 
 
-def chain(t, *, lengths, speed, yaw_rate, headings0, x0=0.0, y0=0.0) -> dict[str, np.ndarray]:
+def chain(t, *, lengths, speed, yaw_rate, headings0) -> dict[str, np.ndarray]:
     """Kinematics of a leader and n trailers, given the leader's speed(t) and yaw_rate(t).
 
-    **Returns:** x, y of the leader's axle, `headings` (times, n + 1), leader first, and `speeds`, the axles'
-    speeds.
+    **Returns:** `headings` (times, n + 1), leader first.
     """
 
     def rates(time, headings):
-        speeds, turns = [speed(time)], [yaw_rate(time)]
-        for i, length in enumerate(lengths):
-            angle = headings[i] - headings[i + 1]
-            turns.append(speeds[i] * np.sin(angle) / length)
-            speeds.append(speeds[i] * np.cos(angle))
-        return speeds, turns
+        along, turns = speed(time), [yaw_rate(time)]
+        for length, ahead, own in zip(lengths, headings[:-1], headings[1:], strict=True):
+            turns.append(along * np.sin(ahead - own) / length)
+            along = along * np.cos(ahead - own)
+        return turns
 
-    def rhs(time, state):
-        speeds, turns = rates(time, state[2:])
-        return [speeds[0] * np.cos(state[2]), speeds[0] * np.sin(state[2]), *turns]
-
-    states = integrate(rhs, [x0, y0, *headings0], t)
-    speeds = np.array([rates(time, row[2:])[0] for time, row in zip(t, states, strict=True)], float)
-    return {"x": states[:, 0], "y": states[:, 1], "headings": states[:, 2:], "speeds": speeds}
+    return {"headings": integrate(rates, headings0, t)}

@@ -41,41 +41,21 @@ RUN_HEAVY_AXLE = {
 
 
 def motion(
-    t,
-    *,
-    radius,
-    length,
-    mass,
-    rim_mass,
-    slope,
-    gravity,
-    phi0,
-    phi_rate,
-    psi1_rate,
-    x1=0.0,
-    y1=0.0,
-    psi1=0.0,
-    psi2=0.0,
-    **_,
+    t, *, radius, length, mass, rim_mass, slope, gravity, phi0, phi_rate, psi1_rate, **_
 ) -> dict[str, np.ndarray]:
-    """x1, y1, z1, psi1, x2, y2, z2, psi2, phi and the rates psi1_rate, psi2_rate, phi_rate (S11)."""
+    """x1, y1, psi1, x2, y2, psi2, from zero but for y2, and the rates psi1_rate, phi_rate (S11)."""
     k = mass * gravity * np.sin(slope) / (mass + rim_mass)  # a psi1'' = k cos(phi)
     path = push_while_turning(t, radius * psi1_rate, k, phi0, phi_rate)
-    phi, ones = path["heading"], np.ones_like(path["heading"])
-    first_x, first_y, first_psi = x1 + path["x"], y1 + path["y"], psi1 + path["s"] / radius
+    x, y, phi = path["x"], path["y"], path["heading"]
     return {
-        "x1": first_x,
-        "y1": first_y,
-        "z1": radius * ones,
-        "psi1": first_psi,
-        "x2": first_x - length * np.sin(phi),
-        "y2": first_y + length * np.cos(phi),
-        "z2": radius * ones,
-        "psi2": psi2 + path["s"] / radius - length * phi_rate * np.asarray(t, float) / radius,
-        "phi": phi,
+        "x1": x,
+        "y1": y,
+        "psi1": path["s"] / radius,
+        "x2": x - length * np.sin(phi),
+        "y2": y + length * np.cos(phi),
+        "psi2": (path["s"] - length * phi_rate * np.asarray(t, float)) / radius,
         "psi1_rate": path["u"] / radius,
-        "psi2_rate": (path["u"] - length * phi_rate) / radius,
-        "phi_rate": phi_rate * ones,
+        "phi_rate": phi_rate + 0 * phi,
     }
 
 

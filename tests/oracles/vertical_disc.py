@@ -12,17 +12,15 @@ from .turning import push_while_turning
 RUN = {"mass": 1.0, "radius": 1.0, "phi0": 0.0, "phi_rate": 2.0, "th_rate": 1.0, "t_end": 1.0}
 
 
-def motion(
-    t, *, radius, phi0, phi_rate, th_rate, th0=0.0, x0=0.0, y0=0.0, mass=1.0, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, radius, phi0, phi_rate, th_rate, mass, **_) -> dict[str, np.ndarray]:
     """x, y, phi, th and the multipliers l1, l2; regular at phi_rate = 0."""
     path = push_while_turning(t, radius * th_rate, 0.0, phi0, phi_rate)
     size = mass * phi_rate * radius * th_rate
     return {
-        "x": x0 + path["x"],
-        "y": y0 + path["y"],
+        "x": path["x"],
+        "y": path["y"],
         "phi": path["heading"],
-        "th": th0 + th_rate * np.asarray(t, float),
+        "th": th_rate * np.asarray(t, float),
         "l1": -size * np.sin(path["heading"]),
         "l2": size * np.cos(path["heading"]),
     }

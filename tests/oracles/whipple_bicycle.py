@@ -10,21 +10,19 @@ the constants below are its values to 21 digits.
 
 import numpy as np
 
-PARAMETERS = {
-    "w": "1.02", "c": "0.08", "lam": "pi/10", "g": "9.81",
-    "rR": "0.3", "mR": "2", "IRxx": "0.0603", "IRyy": "0.12",
-    "xB": "0.3", "zB": "-0.9", "mB": "85", "IBxx": "9.2", "IByy": "11", "IBzz": "2.8", "IBxz": "2.4",
-    "xH": "0.9", "zH": "-0.7", "mH": "4",
-    "IHxx": "0.05892", "IHyy": "0.06", "IHzz": "0.00708", "IHxz": "-0.00756",
-    "rF": "0.35", "mF": "3", "IFxx": "0.1405", "IFyy": "0.28",
+BENCHMARK = {
+    "w": 1.02, "c": 0.08, "lam": np.pi / 10, "g": 9.81,
+    "rR": 0.3, "mR": 2.0, "IRxx": 0.0603, "IRyy": 0.12,
+    "xB": 0.3, "zB": -0.9, "mB": 85.0, "IBxx": 9.2, "IByy": 11.0, "IBzz": 2.8, "IBxz": 2.4,
+    "xH": 0.9, "zH": -0.7, "mH": 4.0,
+    "IHxx": 0.05892, "IHyy": 0.06, "IHzz": 0.00708, "IHxz": -0.00756,
+    "rF": 0.35, "mF": 3.0, "IFxx": 0.1405, "IFyy": 0.28,
 }  # fmt: skip
-BENCHMARK = {key: np.pi / 10 if key == "lam" else float(text) for key, text in PARAMETERS.items()}
 
-M_TEXT = (("80.81722", "2.319413322087091347748"), ("2.319413322087091347748", "0.2978418819968555299862"))
-C1_TEXT = (("0", "33.86641391492494388276"), ("-0.8503564145697843703629", "1.685403973975596741057"))
-K0_TEXT = (("-80.95", "-2.599516852498716407343"), ("-2.599516852498716407343", "-0.8032948845861768808105"))
-K2_TEXT = (("0", "76.59734589573222151899"), ("0", "2.654315237946040252254"))
-M, C1, K0, K2 = (np.array(rows, float) for rows in (M_TEXT, C1_TEXT, K0_TEXT, K2_TEXT))
+M = np.array([[80.81722, 2.319413322087091347748], [2.319413322087091347748, 0.2978418819968555299862]])
+C1 = np.array([[0, 33.86641391492494388276], [-0.8503564145697843703629, 1.685403973975596741057]])
+K0 = np.array([[-80.95, -2.599516852498716407343], [-2.599516852498716407343, -0.8032948845861768808105]])
+K2 = np.array([[0, 76.59734589573222151899], [0, 2.654315237946040252254]])
 
 # speed: castering, capsize (both real), weave real part, weave imaginary part; at v = 0 the weave pair is two
 # real roots.
@@ -121,7 +119,7 @@ AT_5 = {
 }
 
 
-def state_matrix(v: float, m=M, c1=C1, k0=K0, k2=K2, gravity: float = 9.81) -> np.ndarray:
+def state_matrix(v: float, k0=K0) -> np.ndarray:
     """A of d/dt (roll, steer, roll rate, steer rate)."""
-    lower = np.linalg.solve(m, -np.hstack([gravity * k0 + v**2 * k2, v * c1]))
+    lower = np.linalg.solve(M, -np.hstack([9.81 * k0 + v**2 * K2, v * C1]))
     return np.vstack([np.hstack([np.zeros((2, 2)), np.eye(2)]), lower])
