@@ -159,24 +159,6 @@ class AffineRows(InSpace):
         return {"growing": u.x_rate + q.x, "sheet": u.y_rate - self.strength * q.z * u.x_rate}
 
 
-class Cart(jj.Scene):
-    """`m x'' = push - c x' - k x`."""
-
-    mass: float = jj.parameter(2.0, unit="kg", positive=True)
-    damping: float = jj.parameter(0.6, unit="N s/m", non_negative=True)
-    stiffness: float = jj.parameter(5.0, unit="N/m")
-
-    coordinates = jj.coordinates("x")
-    inputs = jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, [q.x, 0.0, 0.0])}
-
-    def loads(self, motion):
-        force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
-        return jj.generalized_force(motion, x_rate=force)
-
-
 class Oscillator(jj.Scene):
     """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
 
@@ -192,6 +174,18 @@ class Oscillator(jj.Scene):
         return jj.generalized_force(
             motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x
         )
+
+
+class Cart(Oscillator):
+    """`m x'' = push - c x' - k x`."""
+
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    damping: float = jj.parameter(0.6, unit="N s/m", non_negative=True)
+    stiffness: float = jj.parameter(5.0, unit="N/m")
+    inputs = jj.inputs("push")
+
+    def loads(self, motion):
+        return super().loads(motion), jj.generalized_force(motion, x_rate=motion.inputs.push)
 
 
 class HoopBead(jj.Scene):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Cart
+from test_native_second import X, _seen
 
 import jourdain_jax as jj
 from jourdain_jax.program import emit
@@ -20,45 +21,11 @@ from jourdain_jax.program.graph import Graph
 pytestmark = machine_code.needed
 
 
-class Oscillator(Cart):
-    """A particle on a spring with a constant push, and a wall at x = -wall."""
-
-    damping: float = jj.parameter(0.0)
-    wall: object = jj.parameter(0.8)
-
-    def events(self, motion):
-        return {"wall": self.wall + motion.q.x}
-
-
-X = np.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
-
-
-def _ends(x):
-    """Two states on the way and at the wall, the time of the end."""
-    scene, start = Oscillator(mass=x[0], stiffness=x[1], wall=x[2]), {"x": x[3], "x_rate": x[4]}
-    options = {"ts": jnp.array([0.0, 0.3, 0.9]), "t1": 3.0, "rtol": 1e-11, "atol": 1e-11}
-    motion = jj.simulate(scene, start, inputs={"push": x[5]}, backend="native", **options)
-    return jnp.stack([motion.q[1, 0], motion.u[2, 0], motion.q_end[0], motion.u_end[0], motion.t_end])
-
-
-def _exact(x, end=None):
-    """x = c + A cos(w t - phase) about c = push/stiffness; at the wall the cosine is -(wall + c)/A."""
-    w, centre = jnp.sqrt(x[1] / x[0]), x[5] / x[1]
-    a, b = x[3] - centre, x[4] / w
-
-    def at(t):
-        return centre + a * jnp.cos(w * t) + b * jnp.sin(w * t), w * (b * jnp.cos(w * t) - a * jnp.sin(w * t))
-
-    if end is None:
-        end = (jnp.arctan2(b, a) + jnp.arccos(-(x[2] + centre) / jnp.hypot(a, b))) / w
-    return jnp.stack([at(0.3)[0], at(0.9)[1], *at(end), end])
-
-
-def test_cotangents_of_lanes_are_those_of_the_closed_form_and_do_not_depend_on_their_company():
-    lanes = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
-    every = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(_ends(x)))))
+def test_cotangents_of_lanes_do_not_depend_on_their_company():
+    """Those of the closed form: see `test_native_second`."""
+    lanes = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 7)))
+    every = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(_seen(x, True)))))
     expected = np.asarray(every(lanes))
-    assert_allclose(expected, jax.vmap(jax.grad(lambda x: jnp.sum(_exact(x))))(lanes), rtol=1e-9, atol=1e-9)
     for count in (3, 9):  # fewer than a register holds, and one more than the widest
         order = np.random.default_rng(count).permutation(11)[:count]
         assert_allclose(every(lanes[order]), expected[order], rtol=1e-13, atol=1e-14)
@@ -67,18 +34,23 @@ def test_cotangents_of_lanes_are_those_of_the_closed_form_and_do_not_depend_on_t
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_derivatives_pass_through_motions_one_after_the_other(derivative):
     """One compiled step, called with numbers of which other ones vary each time."""
-    options = {"inputs": {"push": X[5]}, "rtol": 1e-11, "atol": 1e-11}
+    options = {"inputs": {"push": 0.3}, "rtol": 1e-11, "atol": 1e-11}
     step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, **options).end)
 
     def late(stiffness):
-        scene = Oscillator(mass=X[0], stiffness=stiffness, wall=10.0)
-        state = jj.start(scene, x=X[3], x_rate=X[4])
+        scene = Cart(mass=1.5, damping=0.0, stiffness=stiffness)
+        state = jj.start(scene, x=1.1, x_rate=0.7)
         for until in (0.5, 0.9, 3.0):
             state = step(scene, state, jnp.asarray(until))
         return jnp.concatenate([state.q, state.u])
 
-    exact = jax.jacfwd(lambda k: _exact(jnp.asarray(X).at[1].set(k), 3.0)[2:4])
-    assert_allclose(derivative(late)(X[1]), exact(X[1]), rtol=1e-8)
+    def exact(k):
+        """x = c + a cos(w t) + b sin(w t) about c = push/stiffness, and its rate."""
+        w, c = jnp.sqrt(k / 1.5), 0.3 / k
+        a, b, wave = 1.1 - c, 0.7 / w, jnp.stack([jnp.cos(3 * w), jnp.sin(3 * w)])
+        return jnp.stack([c + jnp.stack([a, b]) @ wave, w * jnp.stack([b, -a]) @ wave])
+
+    assert_allclose(derivative(late)(6.0), jax.jacfwd(exact)(6.0), rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -16,6 +16,7 @@ import pytest
 import result_codes as results
 from derivatives import with_value
 from numpy.testing import assert_allclose
+from slopes import slope
 from small_scenes import OnLine, OnPlane
 from test_mutants import Mutant
 
@@ -398,44 +399,22 @@ def reverse_mode_back_over_projections():
         )
         return jnp.sum(found.ys.q @ jnp.array([0.4, 0.9])) + found.y_end.v[0], found.accepted
 
-    h = 1e-3
-    values = [weighed(1.3 + step * h)[0][0] for step in (-2, -1, 1, 2)]
-    expected = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
+    expected = slope(lambda rate: weighed(rate)[0][0], 1.3)
     (_, steps), found = weighed(1.3)
     assert steps == 2, "no long steps, as this check needs them"
     assert_allclose(found, expected, rtol=0, atol=1e-7, err_msg="derivative with respect to the rate")
 
 
-FORM, LANES, CIRCLE = (
-    motions_follow_the_closed_form,
-    lanes_of_a_batch_follow_their_own,
-    a_bead_stays_on_its_circle,
-)
-EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_is_put_onto_its_rows
-BACK, ALONG, TIME = (
-    reverse_mode_through_saved_times,
-    forward_mode_through_saved_times,
-    reverse_mode_with_respect_to_times,
-)
-EVENT_BACK, EVENT_ALONG, EVENT_TWICE = (
-    reverse_mode_to_an_event,
-    forward_mode_to_an_event,
-    forward_mode_to_an_event_twice,
-)
-BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
-LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
-LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
-STRIP, STICKS, WINDOW = a_strip_is_met, friction_at_rest_sticks, an_event_where_a_relation_changes_is_found
-PROJECTED_BACK = reverse_mode_back_over_projections
-ON, ON_BACK, ON_TWICE = (
-    forward_mode_through_a_transition,
-    reverse_mode_through_a_transition,
-    a_hessian_through_a_transition,
-)
 TRIED, WRONG = "tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant(
-        "a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"
+        "a wrong weight",
+        step,
+        "stages",
+        "method.b[:n]])",
+        "method.b[:n] * (1 + 1e-6)])",
+        motions_follow_the_closed_form,
+        "closed form",
     ),
     Mutant(
         "the whole step for its error",
@@ -443,21 +422,35 @@ MUTANTS = [
         TRIED,
         "weighted(w, weights, k",
         "weighted(w, method.b, k",
-        FORM,
+        motions_follow_the_closed_form,
         "too many|closed form",
     ),
-    Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", FORM, "closed form"),
+    Mutant(
+        "every step accepted",
+        step,
+        "judged",
+        "(error <= 1.0)",
+        "(error <= 1e30)",
+        motions_follow_the_closed_form,
+        "closed form",
+    ),
     Mutant(
         "rows of the tableau too small",
         step,
         "stages",
         "*method.A[1:n, :n],",
         "*(0.999 * method.A[1:n, :n]),",
-        FORM,
+        motions_follow_the_closed_form,
         "closed form|too many",
     ),
     Mutant(
-        "stages at the first time", step, "stages", "w.fma(step, c[i], t)", "t", FORM, "closed form|too many"
+        "stages at the first time",
+        step,
+        "stages",
+        "w.fma(step, c[i], t)",
+        "t",
+        motions_follow_the_closed_form,
+        "closed form|too many",
     ),
     Mutant(
         "a rejected step takes time",
@@ -465,7 +458,7 @@ MUTANTS = [
         "taken",
         '"t": w.where(accept, aim.t_1, p["t"])',
         '"t": aim.t_1',
-        FORM,
+        motions_follow_the_closed_form,
         "closed form",
     ),
     Mutant(
@@ -474,15 +467,53 @@ MUTANTS = [
         "take",
         "w.where(accept, w.load(y1, i), w.load(y, i))",
         "w.load(y1, i)",
-        FORM,
+        motions_follow_the_closed_form,
         "closed",
     ),
-    Mutant("a goal that stays", loop, "_save", "number, last)", "number, saved)", FORM, "closed form"),
-    Mutant("starts of another lane", loop, "_starts", "given, lane)", "given, 0 * lane)", LANES, "lanes"),
-    Mutant("goals of another lane", loop, "goal_of", "lane).place(", "0 * lane).place(", LANES, "lanes"),
-    Mutant("states of another lane", loop, "_save", "every, number)", "every, 0 * number)", LANES, "lanes"),
     Mutant(
-        "no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"
+        "a goal that stays",
+        loop,
+        "_save",
+        "number, last)",
+        "number, saved)",
+        motions_follow_the_closed_form,
+        "closed form",
+    ),
+    Mutant(
+        "starts of another lane",
+        loop,
+        "_starts",
+        "given, lane)",
+        "given, 0 * lane)",
+        lanes_of_a_batch_follow_their_own,
+        "lanes",
+    ),
+    Mutant(
+        "goals of another lane",
+        loop,
+        "goal_of",
+        "lane).place(",
+        "0 * lane).place(",
+        lanes_of_a_batch_follow_their_own,
+        "lanes",
+    ),
+    Mutant(
+        "states of another lane",
+        loop,
+        "_save",
+        "every, number)",
+        "every, 0 * number)",
+        lanes_of_a_batch_follow_their_own,
+        "lanes",
+    ),
+    Mutant(
+        "no bound of steps",
+        step,
+        "judged",
+        ', p["longest"])',
+        ", math.inf)",
+        steps_are_no_longer_than_allowed,
+        "the longest step",
     ),
     Mutant(
         "no bound of series",
@@ -490,7 +521,7 @@ MUTANTS = [
         "_tried_by_series",
         'rows), p["longest"])',
         "rows), math.inf)",
-        SERIES_LONGEST,
+        series_are_no_longer_than_allowed,
         "the longest step",
     ),
     Mutant(
@@ -499,7 +530,7 @@ MUTANTS = [
         "at_start",
         "rises = ((rate > 0.0)",
         "rises = ((rate > 1e9)",
-        LEAVES,
+        a_motion_leaves_an_event_at_which_it_starts,
         "leaves",
     ),
     Mutant(
@@ -508,7 +539,7 @@ MUTANTS = [
         "at_start",
         "& (w.magnitude(a) <= noise * rate)",
         "",
-        LEAVES_BELOW,
+        a_motion_below_an_event_has_none,
         "below",
     ),
     Mutant(
@@ -517,7 +548,7 @@ MUTANTS = [
         "first_sides",
         "w.where(x < 0.0, -1.0",
         "w.where(x < 0.0, 1.0",
-        STRIP,
+        a_strip_is_met,
         "strip|crossings",
     ),
     Mutant(
@@ -526,7 +557,7 @@ MUTANTS = [
         "first_sides",
         "w.where(fresh, side,",
         "w.where(fresh, 0.0,",
-        WINDOW,
+        an_event_where_a_relation_changes_is_found,
         "passed over|place",
     ),
     Mutant(
@@ -535,19 +566,35 @@ MUTANTS = [
         "pass_event",
         "~rests & (rate < 0.0)",
         "~rests & (rate > 0.0)",
-        STICKS,
+        friction_at_rest_sticks,
         "sticks",
     ),
-    Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
-    Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
-    Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
+    Mutant(
+        "no projection",
+        step,
+        "project",
+        'w.run("project", p.pointer, t1, y1)',
+        "None",
+        a_bead_stays_on_its_circle,
+        "circle",
+    ),
+    Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", an_event_is_found, "event"),
+    Mutant(
+        "no dips",
+        step,
+        "monitored",
+        "((share < 1.0) | again)",
+        "again",
+        an_event_within_a_step_is_found,
+        "passed over",
+    ),
     Mutant(
         "dips not looked at",
         event_search,
         "may_fall",
         " & (a + third * slope_a > 0.0) & (b - third * slope_b > 0.0)",
         "",
-        DIP,
+        an_event_within_a_step_is_found,
         "passed over",
     ),
     Mutant(
@@ -556,7 +603,7 @@ MUTANTS = [
         "_follow",
         "w.where(same, old.t[1], old.t[0])",
         "old.t[0]",
-        EVENT,
+        an_event_is_found,
         "event",
     ),
     Mutant(
@@ -565,7 +612,7 @@ MUTANTS = [
         "_write_moved",
         "- w.where(moves, change, 0.0)",
         "- 0.5 * w.where(moves, change, 0.0)",
-        ROWS,
+        a_start_is_put_onto_its_rows,
         "coordinates|speeds",
     ),
     Mutant(
@@ -574,18 +621,34 @@ MUTANTS = [
         "_write_factored",
         "w.load(row, k) * scale, row",
         "w.load(row, k), row",
-        ROWS,
+        a_start_is_put_onto_its_rows,
         "coordinates|speeds",
     ),
-    Mutant("weights of the first stage", adjoint, "step_back", "* b[stage]", "* b[0]", BACK, WRONG),
-    Mutant("no later stages", adjoint, "step_back", "columns[stage][j], total", "0.0, total", BACK, WRONG),
+    Mutant(
+        "weights of the first stage",
+        adjoint,
+        "step_back",
+        "* b[stage]",
+        "* b[0]",
+        reverse_mode_through_saved_times,
+        WRONG,
+    ),
+    Mutant(
+        "no later stages",
+        adjoint,
+        "step_back",
+        "columns[stage][j], total",
+        "0.0, total",
+        reverse_mode_through_saved_times,
+        WRONG,
+    ),
     Mutant(
         "cotangents not scaled by the step",
         adjoint,
         "step_back",
         "return h * total",
         "return total",
-        BACK,
+        reverse_mode_through_saved_times,
         WRONG,
     ),
     Mutant(
@@ -594,7 +657,7 @@ MUTANTS = [
         "step_back",
         "total = w.fma(w.load(G, i + j * count)",
         "total = w.fma(w.load(G, i)",
-        BACK,
+        reverse_mode_through_saved_times,
         WRONG,
     ),
     Mutant(
@@ -603,7 +666,7 @@ MUTANTS = [
         "step_back",
         "w.load(by_known, i) + w.where(took",
         "w.where(took",
-        BACK,
+        reverse_mode_through_saved_times,
         WRONG,
     ),
     Mutant(
@@ -612,7 +675,7 @@ MUTANTS = [
         "_write_added",
         'w.load(place, type="double") + more',
         "more",
-        BACK,
+        reverse_mode_through_saved_times,
         WRONG,
     ),
     Mutant(
@@ -621,7 +684,7 @@ MUTANTS = [
         "step_back",
         'w.run("project_back", state, t + h, at, g1, added)',
         "None",
-        PROJECTED_BACK,
+        reverse_mode_back_over_projections,
         WRONG,
     ),
     Mutant(
@@ -630,7 +693,7 @@ MUTANTS = [
         "event_back",
         "-total / rate",
         "total / rate",
-        EVENT_BACK,
+        reverse_mode_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -639,7 +702,7 @@ MUTANTS = [
         "event_back",
         "w.where(usable, more, 0.0)",
         "w.number(0.0)",
-        EVENT_BACK,
+        reverse_mode_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -648,7 +711,7 @@ MUTANTS = [
         "outputs_of",
         "| {len(y) + i: n for i, n in known[k].items()}",
         "",
-        ALONG,
+        forward_mode_through_saved_times,
         WRONG,
     ),
     Mutant(
@@ -657,7 +720,7 @@ MUTANTS = [
         "put_tangents",
         "-dc / slope",
         "0.0 * dc",
-        EVENT_ALONG,
+        forward_mode_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -666,7 +729,7 @@ MUTANTS = [
         "_move_rows",
         "w.fma(w.load(k, i + rates), dt, before)",
         "before",
-        EVENT_ALONG,
+        forward_mode_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -675,7 +738,7 @@ MUTANTS = [
         "put_tangents",
         "if part > 1:",
         "if part > 9:",
-        EVENT_TWICE,
+        forward_mode_to_an_event_twice,
         WRONG,
     ),
     Mutant(
@@ -684,7 +747,7 @@ MUTANTS = [
         "event_back",
         "dt * w.load(f, i)",
         "0.0 * dt",
-        BENT,
+        a_hessian_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -693,7 +756,7 @@ MUTANTS = [
         "_moved_back",
         "w.where(usable, w.load(out, i), 0.0)",
         "w.number(0.0)",
-        BENT,
+        a_hessian_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -702,7 +765,7 @@ MUTANTS = [
         "_moved_back",
         "w.load(added, asked)",
         "0.0 * g_dt",
-        BENT,
+        a_hessian_to_an_event,
         WRONG,
     ),
     Mutant(
@@ -711,7 +774,7 @@ MUTANTS = [
         "flow_back",
         "jnp.concatenate([dg, g], axis=1)",
         "jnp.concatenate([dg, dg], axis=1)",
-        TIMES_BENT,
+        a_hessian_with_respect_to_times,
         WRONG,
     ),
     Mutant(
@@ -720,7 +783,7 @@ MUTANTS = [
         "reset_program",
         "graph.add(along[n], graph.mul(rate, dt))",
         "along[n]",
-        ON,
+        forward_mode_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -729,17 +792,25 @@ MUTANTS = [
         "reset_program",
         "graph.sub(dx, graph.mul(rate, dt))",
         "dx",
-        ON,
+        forward_mode_through_a_transition,
         WRONG,
     ),
-    Mutant("a jump at a fixed time", transitions, "reset_program", "{t: dt}", "{t: graph.zero}", ON, WRONG),
+    Mutant(
+        "a jump at a fixed time",
+        transitions,
+        "reset_program",
+        "{t: dt}",
+        "{t: graph.zero}",
+        forward_mode_through_a_transition,
+        WRONG,
+    ),
     Mutant(
         "a mode that stays",
         event_search,
         "pass_event",
         'w.at(after, of["mode"].start), modes',
         "modes, modes",
-        ON,
+        forward_mode_through_a_transition,
         "state after",
     ),
     Mutant(
@@ -748,7 +819,7 @@ MUTANTS = [
         "reset_back",
         'w.at(after, of["mode"].start), modes',
         "modes, modes",
-        ON_BACK,
+        reverse_mode_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -757,7 +828,7 @@ MUTANTS = [
         "reset_back",
         "w.load(g, i) * w.load(f_after, i)",
         "0.0 * w.load(g, i)",
-        ON_BACK,
+        reverse_mode_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -766,7 +837,7 @@ MUTANTS = [
         "reset_back",
         "w.load(out, i) + w.load(by_event, i)",
         "w.load(out, i)",
-        ON_BACK,
+        reverse_mode_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -775,7 +846,7 @@ MUTANTS = [
         "write_transition_back",
         '"passed", lane) - 1.0',
         '"passed", lane)',
-        ON_BACK,
+        reverse_mode_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -784,7 +855,7 @@ MUTANTS = [
         "reset_program",
         "graph.sub(dx, graph.mul(rate, dt))",
         "dx",
-        ON_TWICE,
+        a_hessian_through_a_transition,
         WRONG,
     ),
     Mutant(
@@ -793,7 +864,7 @@ MUTANTS = [
         "moved",
         "jax.vjp(partial(rates, plain), z)[1](g)[0]",
         "0 * g",
-        TIMES_BENT,
+        a_hessian_with_respect_to_times,
         WRONG,
     ),
     Mutant(
@@ -802,7 +873,7 @@ MUTANTS = [
         "moved",
         "jnp.sum(scaled(rates(plain, z), g))",
         "0 * jnp.sum(g)",
-        TIME,
+        reverse_mode_with_respect_to_times,
         WRONG,
     ),
 ]

@@ -17,13 +17,12 @@ class Pushed(OnLine):
     """An oscillator with two inputs and a wall."""
 
     inputs = jj.inputs("push pull")
-    mass: object = jj.parameter(1.5)
-    stiffness: object = jj.parameter(6.0)
+    mass = 1.5
     wall: object = jj.parameter(0.8)
 
     def loads(self, motion):
         f = motion.inputs
-        return jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x)
+        return jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - 6.0 * motion.q.x)
 
     def events(self, motion):
         return {"wall": self.wall - motion.q.x}

@@ -22,14 +22,13 @@ class Driven(OnLine):
     -1.2.
     """
 
-    stiffness: float = jj.parameter(6.0, positive=True)
     mass = 1.5
     inputs = jj.inputs("push")
     example = {"x": 1.1, "x_rate": 0.7}
 
     def loads(self, motion):
         push = motion.inputs.push + jnp.cos(2.0 * motion.t) - 0.3 * motion.u.x_rate
-        return jj.generalized_force(motion, x_rate=push - self.stiffness * motion.q.x)
+        return jj.generalized_force(motion, x_rate=push - 6.0 * motion.q.x)
 
     def events(self, motion):
         return {"wall": 1.2 + motion.q.x}

@@ -95,27 +95,17 @@ def test_a_moment_that_no_contact_can_bear_marks_the_shares_but_not_their_sum():
 class Robot(jj.Scene):
     """Two driven discs on an axle and a body above it that may pitch: balanced on two wheels."""
 
-    track: object = jj.parameter(0.5)
-    height: object = jj.parameter(0.4)
-    body: object = jj.parameter(9.0)
-    wheel: object = jj.parameter(1.5)
-    radius: object = jj.parameter(0.12)
-
     coordinates = jj.coordinates("x y heading pitch left right")
 
     def bodies(self, t, q):
         frame, o = jj.rot_z(q.heading), 0.0 * q.x
-        middle = jnp.stack([q.x, q.y, o + self.radius])
+        middle = jnp.stack([q.x, q.y, o + 0.12])
         turned = frame @ jj.rot_y(q.pitch)
-        made = {
-            "body": jj.RigidBody(
-                self.body, jnp.array([0.3, 0.25, 0.1]), middle + self.height * turned[:, 2], turned
-            )
-        }
+        made = {"body": jj.RigidBody(9.0, jnp.array([0.3, 0.25, 0.1]), middle + 0.4 * turned[:, 2], turned)}
         for name, side in (("left", 1.0), ("right", -1.0)):
-            centre = middle + 0.5 * side * self.track * frame[:, 1]
+            centre = middle + 0.25 * side * frame[:, 1]
             made[name] = jj.RigidBody.thin_disc(
-                self.wheel, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q[name])
+                1.5, 0.12, axis="y", position=centre, orientation=frame @ jj.rot_y(q[name])
             )
         return made
 
@@ -123,7 +113,7 @@ class Robot(jj.Scene):
         return jj.gravity(motion, GRAVITY)
 
     def contacts(self, pose):
-        return {name: jj.disc_contact(pose[name], self.radius) for name in ("left", "right")}
+        return {name: jj.disc_contact(pose[name], 0.12) for name in ("left", "right")}
 
 
 @pytest.mark.parametrize(("v", "turn"), [(0.0, 0.0), (1.2, 0.0), (1.5, 0.8), (-1.0, 1.3)])

@@ -4,6 +4,8 @@ number or a vector.
 The run-time checks of `conftest.py` are on here: what an annotation forbids fails.
 """
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,15 +100,23 @@ BUILT = [
 ]
 
 
+@cache
+def right(name):
+    """What is built of an array of JAX."""
+    return _built(name, jnp.asarray(2.0), jnp.array([1.0, 0.0, 2.0]))
+
+
+def _built(name, n, v):
+    return jax.tree.leaves(eval(name, globals() | {"n": n, "v": v}))
+
+
 @pytest.mark.parametrize(
     ("number", "vector"),
     [*((number, "list") for number in TWO), *(("int", vector) for vector in list(THREE)[1:])],
 )
 def test_every_builder_takes_plain_numbers_and_gives_the_same_floats(number, vector):
     for name in BUILT:
-        given = ((TWO[number], THREE[vector]), (jnp.asarray(2.0), jnp.array([1.0, 0.0, 2.0])))
-        found, expected = (jax.tree.leaves(eval(name, globals() | {"n": n, "v": v})) for n, v in given)
-        for x, y in zip(found, expected, strict=True):
+        for x, y in zip(_built(name, TWO[number], THREE[vector]), right(name), strict=True):
             assert jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating), name
             assert np.allclose(x, y, rtol=1e-6, atol=1e-6), name  # float32 stays float32
 

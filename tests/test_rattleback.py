@@ -93,21 +93,3 @@ def test_energy_is_kept_through_every_reversal(motion):
 def test_spinning_the_wrong_way_it_stops_and_turns_back(motion):
     before, after = np.flatnonzero(np.abs(TIMES - oracle.FIRST_REVERSAL) < 1e-5)
     assert motion["w3"][before] < 0 < motion["w3"][after]
-
-
-def test_units_do_not_matter():
-    ((_, q, u),) = admissible_states(STONE, 1)
-    metres = jj.accelerations(STONE, 0.0, q, u).udot
-    scale = {"a": 100, "b": 100, "c": 100, "h": 100, "A": 1e4, "B": 1e4, "C": 1e4, "D": 1e4, "gravity": 100}
-    in_centimetres = STONE.replace(**{name: factor * getattr(STONE, name) for name, factor in scale.items()})
-    level = jnp.array([100.0, 100.0, 1.0, 1.0, 1.0])
-    centimetres = jj.accelerations(in_centimetres, 0.0, level * q, level * u).udot
-    assert relative_error(centimetres / level, metres) <= ROUND_OFF
-
-
-def test_the_normal_force_at_rest_is_the_weight():
-    q, u, _ = STONE.named()
-    force = jax.jit(
-        lambda q, u: jj.newton_residual(STONE, 0.0, q, u, jj.accelerations(STONE, 0.0, q, u).udot).linear[0]
-    )(q, u)
-    assert relative_error(force, [0.0, 0.0, float(STONE.mass * STONE.gravity)]) <= ROUND_OFF

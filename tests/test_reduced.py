@@ -17,22 +17,18 @@ from jourdain_jax.models import (
 )
 
 
-def test_the_reduced_equations_of_the_axle_keep_its_heading_alone():
-    found = reduced_coordinates(TwoWheelAxleFree())
+def test_what_is_found_by_quadrature_is_not_kept():
+    axle, disc, ball, sleigh = map(
+        reduced_coordinates, (TwoWheelAxleFree(), TiltingDisc(), BallOnTurntable(), ChaplyginSleigh())
+    )
     # theta is held by its row, phi2 equals phi1 by its row: both appear, neither moves by itself
-    assert found.kept == ("phi1", "theta1", "phi2", "theta2")
-    assert set(found.recovered) == {"x1", "y1", "z1", "psi1", "x2", "y2", "z2", "psi2"}
-
-
-def test_a_disc_recovers_its_yaw_before_its_place():
-    assert reduced_coordinates(TiltingDisc()).kept == ("lean",)
-    assert reduced_coordinates(TiltingDisc()).dropped == (("yaw", "spin"), ("x", "y"))
-
-
-def test_what_its_own_rate_needs_cannot_be_found_by_quadrature():
+    assert axle.kept == ("phi1", "theta1", "phi2", "theta2")
+    assert set(axle.recovered) == {"x1", "y1", "z1", "psi1", "x2", "y2", "z2", "psi2"}
+    assert disc.kept == ("lean",)
+    assert disc.dropped == (("yaw", "spin"), ("x", "y"))  # the yaw before the place
     # the attitude of a ball, and with it the place, on which the rolling on a turning table depends
-    assert {"attitude_w", "attitude_x", "x", "y"} <= set(reduced_coordinates(BallOnTurntable()).kept)
-    assert reduced_coordinates(ChaplyginSleigh()).kept == ("heading",)
+    assert {"attitude_w", "attitude_x", "x", "y"} <= set(ball.kept)
+    assert sleigh.kept == ("heading",)
 
 
 def test_the_reduced_accelerations_of_the_axle_are_equations_64():

@@ -217,12 +217,11 @@ def test_a_sensor_shows_functions_and_coordinates_under_other_names():
 class Swing(jj.Scene):
     """An arm on an axle along z with a torsional spring: `I turn'' = - k turn`."""
 
-    inertia: float = jj.parameter(0.5, unit="kg m^2", positive=True)
     stiffness: float = jj.parameter(8.0, positive=True)
     coordinates = jj.coordinates("turn")
 
     def bodies(self, t, q):
-        return {"arm": jj.RigidBody(1.0, self.inertia * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))}
+        return {"arm": jj.RigidBody(1.0, 0.5 * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))}
 
     def loads(self, motion):
         return jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn)

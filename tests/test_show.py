@@ -12,6 +12,7 @@ import trimesh
 from browser import needs_browser, screenshot
 from numpy.testing import assert_allclose
 from refusals import refused
+from rolling_scenes import Rolls
 
 import jourdain_jax as jj
 from jourdain_jax.views.looks import guessed
@@ -209,20 +210,8 @@ def test_every_model_is_shown_with_shapes_on_its_ground(name):
     ids=["sphere", "cylinder", "height map", "surface"],
 )
 def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
-    class OnGround(jj.Scene):
-        coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
-
-        def bodies(self, t, q):
-            return {
-                "ball": jj.RigidBody.ball(
-                    1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude)
-                )
-            }
-
-        def contacts(self, pose):
-            return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=make(), height="row")}
-
-    motion = jj.simulate(OnGround(), {"x": 0.05, "x_rate": 0.1}, ts=jnp.linspace(0.0, 0.3, 3))
+    ball = Rolls(radius=0.1, make_ground=lambda scene, pose: make())
+    motion = jj.simulate(ball, {"x": 0.05, "x_rate": 0.1}, ts=jnp.linspace(0.0, 0.3, 3))
     page, numbers = contents(jj.show(motion).html)
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)

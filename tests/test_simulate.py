@@ -24,7 +24,6 @@ class Falling(Upright):
     mass: object = jj.parameter(1.0, positive=True)
     gravity: object = jj.parameter(9.81)
     drag: object = jj.parameter(0.0)
-    push: object = jj.parameter(0.0)
 
     inputs = jj.inputs("force")
     example = {"z_rate": 5.0, "x_rate": 2.0}

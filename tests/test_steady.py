@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from oracles import rolling_disc
+from slopes import slope
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -43,26 +44,15 @@ def _spin(radius, lean):
 def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     """In a parameter and in a held value, forward and reverse."""
     closed = lambda radius, lean: _circle(lean, 2.0, radius=radius)
-    h = 1e-4
-    expected = [
-        (closed(0.5 + h, 0.3) - closed(0.5 - h, 0.3)) / (2 * h),
-        (closed(0.5, 0.3 + h) - closed(0.5, 0.3 - h)) / (2 * h),
-    ]
+    expected = slope(lambda x: closed(x, 0.3), 0.5), slope(lambda x: closed(0.5, x), 0.3)
     reverse = jax.jit(jax.grad(_spin, (0, 1)))(0.5, 0.3)
     assert_allclose(reverse, expected, rtol=1e-6)
     assert_allclose(jax.jit(jax.jacfwd(_spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
 
 
 def test_second_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
-    h = 1e-4
-    second = (
-        _circle(0.3, 2.0, radius=0.5 + h)
-        + _circle(0.3, 2.0, radius=0.5 - h)
-        - 2 * _circle(0.3, 2.0, radius=0.5)
-    ) / h**2
-    assert_allclose(
-        jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5
-    )  # differences of second order at 1e-4
+    second = slope(lambda x: slope(lambda radius: _circle(0.3, 2.0, radius=radius), x), 0.5)
+    assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5)
 
 
 def test_steady_motions_are_found_in_batches():

@@ -24,11 +24,9 @@ class Damped(OnLine):
     `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t.
     """
 
-    rate: object = jj.parameter(1e7, positive=True)
-
     def loads(self, motion):
         return jj.generalized_force(
-            motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)
+            motion, x_rate=-1e7 * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)
         )
 
 
@@ -221,12 +219,10 @@ class Following(OnPlane):
     place; y falls to the floor by 1 m/s^2.
     """
 
-    rate: object = jj.parameter(1e6)
-
     def loads(self, motion):
         q, u = motion.q, motion.u
         return jj.generalized_force(
-            motion, x_rate=-self.rate * (q.x - jnp.sin(q.y)) - self.rate * u.x_rate, y_rate=-1.0 + 0.0 * q.x
+            motion, x_rate=-1e6 * (q.x - jnp.sin(q.y) + u.x_rate), y_rate=-1.0 + 0.0 * q.x
         )
 
     def events(self, motion):

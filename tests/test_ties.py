@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from refusals import refused
+from slopes import slope
 
 import jourdain_jax as jj
 from jourdain_jax.identification import MultipleShooting, log_density, log_likelihood, unbounded
@@ -68,11 +69,9 @@ def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
 
 def test_a_density_has_the_slope_along_the_tie(data):
     density = log_density(Sleigh(mass=2.0), data, free={"offset": unbounded(0.1), "inertia": TIED["inertia"]})
-    step = 1e-5
-    slope = [float(density(density.unconstrain({"offset": 0.3 + k * step}))) for k in (-1, 1)]
-    found = jax.grad(density)(density.unconstrain({"offset": 0.3}))
-    assert_allclose(found[0], (slope[1] - slope[0]) / (2 * step), rtol=1e-6)
-    assert_allclose(density.scene_at(density.unconstrain({"offset": 0.3})).inertia, 0.3, rtol=1e-14)
+    at = lambda offset: density.unconstrain({"offset": offset})
+    assert_allclose(jax.grad(density)(at(0.3))[0], slope(lambda x: density(at(x)), 0.3, 1e-5), rtol=1e-6)
+    assert_allclose(density.scene_at(at(0.3)).inertia, 0.3, rtol=1e-14)
 
 
 def test_ties_of_a_batch_and_in_pieces_are_those_of_one_fit(found, data):

@@ -187,6 +187,10 @@ WRONG = {  # methods of the sledge, the check that must fail, and what it must n
         [[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"
     ),
     "a negative moment": inertia([[0.2, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.1]], NEGATIVE),
+    "a moment above the sum of the others": inertia(
+        jnp.diag(jnp.array([0.2, 0.3, 0.6])).tolist(),
+        "body `sledge`: a principal moment of inertia exceeds the sum of the other two",
+    ),
     "a large product of inertia": inertia([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], NEGATIVE),
     "an inertia that is not a number": inertia([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]]),
     "a negative mass": (bead(-0.3, lambda x: x), "inertia", "body `bead`: its mass is negative"),
