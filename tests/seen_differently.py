@@ -219,24 +219,10 @@ class Seen(jj.Scene):
         return None if V is None else V / (self._power() * self.view.time)
 
     def geometric_constraints(self, pose):
-        return dict(
-            reversed(
-                [
-                    (f"seen {name}", value)
-                    for name, value in position_rows(self.scene, self._pose(pose)).items()
-                ]
-            )
-        )
+        rows = position_rows(self.scene, self._pose(pose))
+        return {f"seen {name}": rows[name] for name in reversed(rows)}
 
     def velocity_constraints(self, motion):
         seen = self._motion(motion)
-        held = position_rows(self.scene, seen.pose())
-        return dict(
-            reversed(
-                [
-                    (f"seen {name}", value)
-                    for name, value in velocity_rows(self.scene, seen).items()
-                    if name not in held
-                ]
-            )
-        )
+        rows, held = velocity_rows(self.scene, seen), position_rows(self.scene, seen.pose())
+        return {f"seen {name}": rows[name] for name in reversed(rows) if name not in held}

@@ -24,9 +24,9 @@ def of(*symbols_used):
     return {symbol: VALUES[symbol] for symbol in symbols_used}
 
 
-def pendulum(**changes):
+def pendulum(load=None, mass=m, **changes):
     """A particle on a rod, with a torque on the rod that is an input, a damper, and a pivot moved by a given
-    force.
+    force; or with another load on the particle alone, `load(q, N)`.
     """
     q, u, torque = dynamicsymbols("q u torque")
     N, O = ReferenceFrame("N"), Point("O")
@@ -36,24 +36,13 @@ def pendulum(**changes):
     loads = [(P, -m * g * N.z), (A, (torque - c * q.diff() + sin(2 * dynamicsymbols._t)) * A.y)]
     options = {
         "kd_eqs": [q.diff() - u],
-        "bodies": [Particle("bob", P, changes.pop("mass", m))],
-        "forcelist": changes.pop("loads", loads),
+        "bodies": [Particle("bob", P, mass)],
+        "forcelist": [(P, load(q, N))] if load else loads,
     }
-    return KanesMethod(N, [q], [u], **(options | changes)), O, of(m, length, g, c)
+    return KanesMethod(N, [q], [u], **(options | changes)), O, of(m, length, *(() if load else (g, c)))
 
 
-def pendulum_with(load):
-    """The pendulum with another load on its particle, `load(q, N)`."""
-    q, u = dynamicsymbols("q u")
-    N, O = ReferenceFrame("N"), Point("O")
-    A = N.orientnew("A", "Axis", [q, N.y])
-    P = O.locatenew("P", -length * A.z)
-    O.set_vel(N, 0)
-    return (
-        KanesMethod(N, [q], [u], [q.diff() - u], bodies=[Particle("bob", P, m)], forcelist=[(P, load(q, N))]),
-        O,
-        of(m, length),
-    )
+pendulum_with = pendulum
 
 
 def moved_pivot():

@@ -61,6 +61,7 @@ class Slider(jj.Scene):
         return jj.generalized_force(motion, x_rate=motion.inputs.push, angle_rate=1)
 
 
+@cache
 def _motion():
     return jj.motion_at(Slider(), 0, [0.3, 0.2], [1, 0.5])
 

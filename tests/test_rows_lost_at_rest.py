@@ -2,6 +2,8 @@
 beyond, whatever times are saved.
 """
 
+from functools import cache
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -32,7 +34,8 @@ PASSED = {
 }
 
 
-def _scene(row, stop, pull=0.0):
+@cache
+def _lawful(row):
     class Lawful(InSpace):
         """A particle whose speeds obey a row."""
 
@@ -46,7 +49,11 @@ def _scene(row, stop, pull=0.0):
         def loads(self, motion):
             return jj.gravity(motion, self.pull, (0.0, -1.0, 0.0))
 
-    return Lawful(stop=stop, pull=pull)
+    return Lawful
+
+
+def _scene(row, stop, pull=0.0):
+    return _lawful(row)(stop=stop, pull=pull)
 
 
 def _end(scene, speeds, **options):
