@@ -625,6 +625,15 @@ MUTANTS = [
         "coordinates|speeds",
     ),
     Mutant(
+        "rows that are never left",
+        projection_kernel,
+        "_write_settled",
+        "* (8 * w.eps)",
+        "* 8.0",
+        a_start_is_put_onto_its_rows,
+        "coordinates|speeds",
+    ),
+    Mutant(
         "weights of the first stage",
         adjoint,
         "step_back",

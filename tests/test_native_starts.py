@@ -73,6 +73,27 @@ def test_named_starts_of_all_models_are_alike(name):
     assert ours.residual < 1e-12 * (1 + float(jnp.max(jnp.abs(ours.u))))
 
 
+@pytest.mark.parametrize("trailers", [3, 16])
+def test_states_on_the_rows_stay_and_those_beside_them_move(trailers):
+    """The rows of 16 trailers are too many for machine code."""
+    scene = jj.models.TrailerChain(trailers=trailers)
+    at = jj.start(scene, scene.example)
+    off = 1e-3 * np.random.default_rng(0).standard_normal(at.u.shape)
+    put = jax.jit(lambda q, u: _put(True)(scene, q, u))
+    alone, moved = put(at.q, at.u), put(at.q, at.u + off)
+    assert_array_equal(alone.q, at.q)
+    assert_array_equal(alone.u, at.u)
+    assert moved.moved_u > 1e-4
+    assert moved.residual < 1e-14
+    lanes = jax.vmap(put)(jnp.stack([at.q, at.q]), jnp.stack([at.u, at.u + off]))
+    assert_array_equal(lanes.u[0], at.u)
+    assert_allclose(lanes.u[1], moved.u, atol=1e-14)
+    # with the derivatives of the projection, whose square is itself and whose trace is the rank
+    slopes = jax.jacfwd(lambda u: put(at.q, u).u)(at.u)
+    assert_allclose(slopes @ slopes, slopes, atol=1e-13)
+    assert_allclose(np.trace(slopes), 2, atol=1e-13)
+
+
 def test_lanes_that_are_no_numbers_and_those_that_run_away():
     q, u = _near_rows(BICYCLE, 5)
     q = q.at[1].set(jnp.nan).at[2, 0].set(jnp.inf).at[4, 3].set(1e3)

@@ -18,6 +18,7 @@ identifies the others.
 
 from functools import partial
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -36,6 +37,17 @@ def pseudo_inverse(
     if 0 in A.shape:
         return jnp.zeros(A.shape[::-1], A.dtype)
     cutoff = rank_cutoff(A.dtype) if cutoff is None else cutoff
+    wide = A.shape[0] < A.shape[1]
+    Q, R = jnp.linalg.qr(A.T if wide else A)
+    P = jax.scipy.linalg.solve_triangular(R, Q.T)
+    P = P.T if wide else P
+    # the product of the norms is at least the ratio of the largest singular value to the smallest
+    regular = jnp.linalg.norm(A) * jnp.linalg.norm(P) * cutoff < 1  # false for NaN
+    truncated = jax.lax.cond(eqxi.unvmap_any(~regular), lambda: _truncated(A, cutoff), lambda: P)
+    return jnp.where(regular, P, truncated)
+
+
+def _truncated(A, cutoff: float):
     left, sigma, right = jnp.linalg.svd(A, full_matrices=False)
     keep = ~(sigma <= cutoff * sigma[0])  # written so that NaN is kept
     inverse = jnp.where(keep, 1 / jnp.where(keep, sigma, 1), 0)

@@ -12,12 +12,23 @@ two calls of machine code.
 from functools import lru_cache, partial
 
 import equinox as eqx
+import equinox.internal as eqxi
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import differentiated_as, with_derivatives_of
-from jourdain_jax.calculus.reals import Entries, PerCoordinate, PerRow, Speeds, rank_cutoff, real_type, static
+from jourdain_jax.calculus.reals import (
+    Entries,
+    PerCoordinate,
+    PerRow,
+    Speeds,
+    eps_of,
+    rank_cutoff,
+    real_type,
+    static,
+)
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.integrate.loop import projection_kernel
@@ -93,7 +104,7 @@ def put_positions(
 
     given = (scene, *usual.plain), jnp.asarray(t), q, free, usual.closures
     if known is None:
-        return _by_either(usual, "positions", False, by_xla)(*given)
+        return _by_either(usual, "positions", False, by_xla, 1)(*given)
 
     return with_derivatives_of(lambda _, *given: by_xla(functions_of_rows(usual), *given), known, *given)
 
@@ -110,7 +121,7 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speed
         return near_u, by.rows(by.given(*scenes), t, q, near_u, inputs)[0]
 
     kind = "determined speeds" if determined else "speeds"
-    return _by_either(usual, kind, affine or determined, by_xla)(
+    return _by_either(usual, kind, affine or determined, by_xla, 2)(
         (scene, *usual.plain), jnp.asarray(t), q, u, inputs, free, usual.rows
     )
 
@@ -120,11 +131,25 @@ def functions_of_rows(usual: Usual) -> RowFunctions:
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
-def _by_either(usual: Usual, kind, affine: bool, by_xla):
-    of_rows = partial(by_xla, functions_of_rows(usual))
-    if usual.program is None or (rows := Rows(usual.program, kind, affine)).reason_against():
+def _by_either(usual: Usual, kind, affine: bool, by_xla, place: int):
+    """Return the projection of the variables at a `place` among its vectors."""
+    by = functions_of_rows(usual)
+    of_rows = partial(by_xla, by)
+    if usual.program is None:
         return of_rows
-    return differentiated_as(of_rows, partial(_put, rows))
+    if not (rows := Rows(usual.program, kind, affine)).reason_against():
+        return differentiated_as(of_rows, partial(_put, rows))
+    at = by.closures if kind == "positions" else by.rows
+
+    def unless_settled(scenes: tuple[Scene, ...], *vectors):
+        x = vectors[place]
+        r, A = at(by.given(*scenes), *vectors[:-2])
+        size, eps = jnp.abs(x), eps_of(x)  # as in the kernel
+        moves = ~jnp.all(jnp.abs(r) <= 8 * eps * (jnp.abs(A) @ (size + eps * jnp.max(size))))
+        moved = jax.lax.cond(eqxi.unvmap_any(moves), lambda: of_rows(scenes, *vectors), lambda: (x, r))
+        return tuple(jnp.where(moves, *pair) for pair in zip(moved, (x, r), strict=True))
+
+    return differentiated_as(of_rows, unless_settled)
 
 
 @lru_cache(maxsize=64)

@@ -4,7 +4,10 @@ program of the constraints, for several lanes.
     x <- x - W (d A W)+ d r(x),   A = dr/dx for the free variables,   d: reciprocal row lengths
 
 r: geometric constraints (x: coordinates) or velocity constraints (x: speeds); W = 1, or W = c L'^-1 with
-c M c = L L' for the nearest speeds in the metric of the mass matrix. Lanes that have converged do not change.
+c M c = L L' for the nearest speeds in the metric of the mass matrix. Lanes that have converged do not change;
+those whose residuals are mere round-off at the start have.
+
+    |r_i| <= 8 eps sum_k |A_ik| (|x_k| + eps max |x|)
 
 Dense linear algebra is written as loops. Each lane has its own matrix; an entry for all lanes is a vector in
 memory, and entries are stored row by row.
@@ -19,6 +22,8 @@ numbers.
 
 import math
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from typing import Literal
 
 from jourdain_jax.calculus.reals import Indices
@@ -204,9 +209,9 @@ class Rows:
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
-        # Limit on entries of a matrix. Measured in ms for speeds of trailers, by machine code and by XLA,
-        # alone, then per sample of a batch: 6 trailers 0.10 and 0.08, 0.05 and 0.06; 12 trailers (2,812
-        # entries) 0.68 and 0.20, 0.32 and 0.18; 32 trailers 14.6 and 1.4, 3.6 and 1.2.
+        # Limit on entries of a matrix. Measured in ms for speeds of trailers off the constraints, by machine
+        # code and by XLA, alone, then per sample of a batch: 6 trailers 0.09 and 0.08, 0.015 and 0.050; 12
+        # trailers (2,812 entries) 0.63 and 0.19, 0.11 and 0.19.
         if max((rows + columns) * rows, columns**2) > 3_000:
             return "there are too many constraints"
         nodes = [
@@ -236,6 +241,7 @@ def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
         write_triangular(w, columns)
         _write_metric(w, of)
     _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
+    _write_settled(w, of)
     _write_factored(w, of)
     _write_moved(w, of)
     _write_row(w, of)
@@ -275,6 +281,23 @@ def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
     """
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
+
+
+def _write_settled(w: MachineWriter, of: Rows) -> None:
+    """Write `settled(state, quiet)`, which stores the number of steps without change: `QUIET` in lanes whose
+    residuals are mere round-off, and 0 in others.
+    """
+    nodes, bound = [*of.residuals, *of.slopes.values()], [w.number(0.0)] * len(of.residuals)
+    with w.procedure("settled", "state quiet") as (state, quiet):
+        known = {n: w.load(state, k) for k, n in enumerate(of.given)}
+        values = dict(written_in_turn(w, of.program.graph, nodes, known))
+        found = [w.magnitude(as_real(w, values[k])) for k in range(len(nodes))]
+        sizes = [w.magnitude(known[n]) for n in of.moving]
+        least = reduce(w.larger, sizes) * w.eps
+        for slope, (i, k) in zip(found[len(bound) :], of.slopes, strict=True):
+            bound[i] = w.fma(slope, sizes[k] + least, bound[i])
+        settled = [left <= most * (8 * w.eps) for left, most in zip(found, bound, strict=False)]  # not if NaN
+        w.store(w.where(reduce(and_, settled), float(QUIET), 0.0), quiet)
 
 
 def _write_factored(w: MachineWriter, of: Rows) -> None:
@@ -331,43 +354,37 @@ def _write_moved(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_row(w: MachineWriter, of: Rows) -> None:
-    """Write `row(state, found)`, which computes the results of a block of samples from their arguments."""
+    """Write `row(state, found)`, which computes the results of a block of samples from their arguments. The
+    iteration ends when steps no longer change the variables (see `calculus/roots.py`).
+    """
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
+    most = MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS
     with w.procedure("row", "state found") as (state, found):
         n = columns if of.metric is not None else 0
         sizes = n * n, n, rows * (rows + columns), rows, rows, columns
         L, c, *factors, x = (w.room(max(count, 1)) for count in sizes)
-        if of.metric is not None:
-            w.run("metric", state, L, c)
-        if of.affine:
-            w.run("factored", state, L, c, *factors)
-            for _ in range(2):
-                w.run("moved", state, L, c, *factors, x)
-                with w.counted(columns) as k:
-                    w.store(w.load(x, k), state, k + first)
-        else:
-            _write_iteration(w, of, first, (state, L, c, *factors, x))
+        quiet, changed = w.room(), w.room()
+        w.run("settled", state, quiet)
+        with w.when(w.any(w.load(quiet) < float(QUIET))):
+            if of.metric is not None:
+                w.run("metric", state, L, c)
+            if of.affine:
+                w.run("factored", state, L, c, *factors)
+            with w.counted(2 if of.affine else most):
+                going = w.load(quiet) < float(QUIET)
+                with w.when(w.any(going)):
+                    if not of.affine:
+                        w.run("factored", state, L, c, *factors)
+                    w.run("moved", state, L, c, *factors, x)
+                    w.store(-math.inf, changed)
+                    with w.counted(columns) as k:
+                        old, new = w.load(state, k + first), w.load(x, k)
+                        beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * w.eps)
+                        w.store(w.where(beyond, 1.0, w.load(changed)), changed)
+                        w.store(w.where(going, new, old), state, k + first)
+                    still = w.where(w.load(changed) > 0.0, 0.0, w.load(quiet) + 1.0)
+                    w.store(w.where(going, still, w.load(quiet)), quiet)
         with w.counted(columns) as k:
             w.store(w.load(state, k + first), found, k)
         w.run("residuals", state, w.at(found, columns))
-
-
-def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:
-    """Write the iteration, which ends when steps no longer change the variables (see `calculus/roots.py`)."""
-    state, *factors, x = places
-    columns, quiet, changed = len(of.moving), w.room(), w.room()
-    w.store(0.0, quiet)
-    with w.counted(MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
-        going = w.load(quiet) < float(QUIET)
-        with w.when(w.any(going)):
-            w.run("factored", state, *factors)
-            w.run("moved", state, *factors, x)
-            w.store(-math.inf, changed)
-            with w.counted(columns) as k:
-                old, new = w.load(state, k + first), w.load(x, k)
-                beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * w.eps)
-                w.store(w.where(beyond, 1.0, w.load(changed)), changed)
-                w.store(w.where(going, new, old), state, k + first)
-            still = w.where(w.load(changed) > 0.0, 0.0, w.load(quiet) + 1.0)
-            w.store(w.where(going, still, w.load(quiet)), quiet)
