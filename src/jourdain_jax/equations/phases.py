@@ -266,12 +266,13 @@ def contact_changes(at: At) -> dict[str, Event]:
     """
     events, names, now = {}, at.scene.switching.contacts, at.motion.u.array
     together = (at.found.rows.gap < SAME) & (at.w[:, 0] < 0)
-    values, size = contact_events(at), jnp.sum(jnp.abs(switching_forces(at.scene, at.motion, at.found)))
+    values = contact_events(at)
     for i, name in enumerate(names):
         number, own = at.number[i], jnp.arange(len(names)) == i
         normal, tangent = values[f"{name} normal"], values[f"{name} tangent"]
         strikes, rolls, stops = number == FLIES, number == ROLLS, (number == SLIPS) & (tangent < LEAST_SLIP)
-        breaks = (~strikes & (normal < -ROUND_OFF * size)) | (rolls & (tangent < -ROUND_OFF * size**2))
+        force = jnp.sum(at.found.size) / at.found.G[3 * i, 3 * i]  # a scale also where the forces vanish
+        breaks = (~strikes & (normal < -ROUND_OFF * force)) | (rolls & (tangent < -ROUND_OFF * force**2))
         met = own | together if at.rows[i].impact == "moreau" else own
         found = after(at, i, strikes & (at.number == FLIES) & met, own & stops, own & rolls & ~breaks)
         ends = PAINLEVE

@@ -237,6 +237,7 @@ class ContactResponse(eqx.Module):
     impulses: Float[Array, "speeds rows"]  # M^-1 A', with the permanent constraints satisfied
     G: Float[Array, "rows rows"]
     b: PerRow
+    size: PerRow  # sums of magnitudes of the terms of b
 
 
 @eqx.filter_jit  # traced once
@@ -262,10 +263,9 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
         moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
     impulses, free = moved[:count, :-1], moved[:count, -1]
     # a constraint with a force limit has unit normal force, the solution of L_n - 1 = 0
-    names, held_rows = scene.switching.contacts, scene.switching.rows
-    one = jnp.array([[name in held_rows, 0, 0] for name in names], free.dtype).ravel()
+    one = jnp.array([[x in scene.switching.rows, 0, 0] for x in scene.switching.contacts], free.dtype).ravel()
     G, b = rows.A @ impulses + jnp.diag(one), rows.A @ free + rows.drift - one
-    return ContactResponse(rows, impulses, G, b)
+    return ContactResponse(rows, impulses, G, b, jnp.abs(rows.A) @ jnp.abs(free) + jnp.abs(rows.drift))
 
 
 def numbers_and_slots(scene: Scene, motion: Motion) -> tuple[PerContact, Float[Array, "contacts 2"]]:

@@ -44,6 +44,7 @@ from jourdain_jax.integrate.event_values import (
     falls_through,
     first_event,
     is_flat,
+    is_level,
     lowest,
     may_fall,
     no_event,
@@ -52,7 +53,15 @@ from jourdain_jax.integrate.event_values import (
 )
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_row
-from jourdain_jax.integrate.loop.transitions import Happened, goes_on, is_left, is_side, pass_event, slowest
+from jourdain_jax.integrate.loop.transitions import (
+    SLOWLY,
+    Happened,
+    goes_on,
+    is_left,
+    is_side,
+    pass_event,
+    slowest,
+)
 from jourdain_jax.integrate.relation_sides import leaving, on_their_way
 
 RUNNING, LOCATING = -1, -2  # code: a running motion, and one that locates an event
@@ -174,14 +183,23 @@ def monitored(
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
         """Reverse the sign of values that have not left zero since their event. A value that rises and falls
-        again within one step is then found as a new event.
+        again within one step is then found as a new event. Values that are positive by round-off after an
+        event do not dip: near a triple zero, as after a lift-off, the cubic dips by its own error.
         """
         if not form.goes_on:
             return found
-        off = p.every("disarmed")
+        off, noise = p.every("disarmed"), reach_of_noise(w, p["last_goal"])
+        follows = w.equal(p["accepted"], p["begun"]) & (p["passed"] > 0.0)
+        level = [
+            follows & is_level(w, a, slope, b, h, noise)
+            for a, slope, b in zip(*at_begin, at_end[0], strict=True)
+        ]
         return [
-            [w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)]
-            for pair in zip(found, armed(found), strict=True)
+            [
+                w.where(x > 0.0, -c, w.where(rests, kept, c_armed))
+                for x, c, rests, c_armed in zip(off, values, level, now, strict=True)
+            ]
+            for values, now, kept in zip(found, armed(found), (1.0, 0.0), strict=True)
         ]
 
     at_begin, at_end = events(t, y, k[0]), events(new["t"], y1, k[1])
@@ -209,9 +227,10 @@ def monitored(
             sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
             zero = [w.smaller(c, 0.0) for c in at_begin[0]]
             _, below = at_start(w, zero, at_begin[1], at_end[0], h, p["direction"], p["last_goal"])
-            returns = fresh & any_of(
-                [(off > 0.0) & x for off, x in zip(p.every("disarmed"), below, strict=True)]
-            )
+            off = p.every("disarmed")
+            returns = fresh & any_of([(x > 0.0) & b for x, b in zip(off, below, strict=True)])
+            # however short the step, the value falls back
+            hides = fresh & any_of([w.equal(x, SLOWLY) & b for x, b in zip(off, below, strict=True)])
         sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
         sinks = [x & ~sunk_now for x in sinks]
         again = (any_of(sinks) | returns) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
@@ -290,6 +309,8 @@ def monitored(
             changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
             # crossings count as trial steps, which limits their number
             changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
+            hides = hides & accept & ~dips
+            changed["code"] = w.where(hides, float(result_codes.ZENO), changed["code"])
             changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
             changed["event"] = w.where(goes, -1.0, changed["event"])
         if form.moving:

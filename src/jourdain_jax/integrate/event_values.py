@@ -45,12 +45,17 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, h, direction, span) -
     sunk, sinks, noise = [], [], reach_of_noise(w, span)
     for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
         rate, change = slope * direction, w.magnitude(b - a)
-        straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # change along a straight line
-        level = ~(a > 0.0) & (change > 0.0) & (straight * w.magnitude(h) <= noise * change)
+        level = ~(a > 0.0) & (change > 0.0) & is_level(w, a, slope, b, h, noise)
         rises = ((rate > 0.0) & (w.magnitude(a) <= noise * rate)) | level
         sunk.append(~(a > 0.0) & ~rises)
         sinks.append(rises & ~(b > 0.0))
     return sunk, sinks
+
+
+def is_level(w, a, slope, b, h, noise):
+    """Return whether value and rate at the start of a step `h` are round-off relative to the change."""
+    straight = w.larger(w.magnitude(a), w.magnitude(h * slope))  # change along a straight line
+    return straight * w.magnitude(h) <= noise * w.magnitude(b - a)
 
 
 def first_event(w, before: Values, after: Values):

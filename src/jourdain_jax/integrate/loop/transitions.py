@@ -31,6 +31,7 @@ from jourdain_jax.kernels.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList
 
+SLOWLY = 2.0  # code: a disarmed value whose rate afterwards is positive, but within round-off
 RESTS = 1e-3  # numerics: fraction of the absolute tolerance: far below errors of steps, and above round-off
 
 
@@ -224,9 +225,8 @@ class Happened(NamedTuple):
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
     """Store the state after an event in `y1`, and record the event and the state before.
 
-    If a motion cannot continue, its code is stored in `stuck`: the event's value rises afterwards so slowly
-    that round-off hides it, a mode is negative (a code for failed contacts), or a relation would change back
-    at once.
+    If a motion cannot continue, its code is stored in `stuck`: a mode is negative (a code for failed
+    contacts), or a relation would change back at once.
     """
     event, t, flat, quiet, switches, noise, found = happened
     side = is_side(w, form, event)
@@ -268,9 +268,9 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         this = w.equal(event, float(i)) & switches
         # `slow` is for bounces only, at which the value itself does not jump
         slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))
-        w.store(w.where(slow, float(result_codes.ZENO), w.load(stuck)), stuck)
         left_now = switches & is_left(w, c, rate, noise)
-        disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
+        off = w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old))
+        disarmed.append(w.where(slow, SLOWLY, off))
     p.put("disarmed", disarmed)
     for i in range(form.modes):
         mode = w.load(modes, i)
