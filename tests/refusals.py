@@ -3,7 +3,8 @@
 import pytest
 
 
-def refused(said: str, call, *given, **named) -> None:
-    """The call ends in a ValueError whose text matches."""
-    with pytest.raises(ValueError, match=said):
+def refused(said: str, call, *given, **named) -> str:
+    """The text of the ValueError in which the call ends, which must match."""
+    with pytest.raises(ValueError, match=said) as error:
         call(*given, **named)
+    return str(error.value)

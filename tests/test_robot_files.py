@@ -247,9 +247,7 @@ NO_FILES = {
 def test_files_that_are_none_are_refused_with_their_name(tmp_path, reader, case):
     path = tmp_path / "robot.xml"
     path.write_bytes(NO_FILES[case])
-    with pytest.raises(ValueError, match=r"robot.xml: ") as error:
-        reader(path)
-    assert len(str(error.value)) < 1000
+    assert len(refused(r"robot.xml: ", reader, path)) < 1000
     if NO_FILES[case].startswith(b"<") and NO_FILES[case].isascii():
         refused(r"the (URDF|MJCF) text: ", reader, NO_FILES[case].decode())
 
@@ -257,9 +255,7 @@ def test_files_that_are_none_are_refused_with_their_name(tmp_path, reader, case)
 @pytest.mark.parametrize("path", ["x" * 10_000, "zero\0byte.urdf", ".", ""])
 @pytest.mark.parametrize("reader", [jj.from_urdf, jj.from_mjcf])
 def test_paths_that_are_none_are_refused(reader, path):
-    with pytest.raises(ValueError, match=r"cannot be read|expected the name of a file") as error:
-        reader(path)
-    assert len(str(error.value)) < 600
+    assert len(refused("cannot be read|expected the name of a file", reader, path)) < 600
 
 
 NO_NUMBERS = ["1_0", "\u0661", "\uff11", "0x1", "nan", "inf", "1e999", "1,5", "", "1\u00a00"]

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from refusals import refused
 from test_inputs import OnBelt
 from test_storage import assert_equal_to_the_bit
 
@@ -188,9 +189,7 @@ ARCHIVES = {
 def test_an_archive_that_claims_what_it_does_not_hold_is_named(saved, tmp_path, change):
     read, _, path = saved
     new = _rezipped(path, tmp_path / "new.npz", change)
-    with pytest.raises(ValueError, match=r"new.npz`.* (not a|nested|has)") as error:
-        read(new)
-    assert len(str(error.value)) < 600
+    assert len(refused(r"new.npz`.* (not a|nested|has)", read, new)) < 600
 
 
 def test_whatever_happens_to_a_byte_of_a_file_it_is_the_motion_or_named(saved, tmp_path):
