@@ -67,7 +67,7 @@ def stiffness(scene, way):
     if way == "accelerations":
         return -float(jj.accelerations(scene, 0.0, jnp.ones(1), jnp.zeros(1)).udot[0])
     if way == "rollout":
-        end = jj.rollout(scene, {"x": jnp.ones(2)}, t1=1.0, progress=False).lanes.q_end[0, 0]
+        end = jj.rollout(scene, {"x": jnp.ones(2)}, t1=1.0).lanes.q_end[0, 0]
     elif way == "jit":
         end = compiled_by_the_user(scene)
     else:

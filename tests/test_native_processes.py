@@ -34,7 +34,7 @@ def ends():
     starts = {"lean": np.linspace(0.1, 0.3, 500)}
     return np.asarray(
         jj.rollout(
-            jj.models.TiltingDisc(), starts, ts=[0.2], rtol=1e-6, backend="native", progress=False
+            jj.models.TiltingDisc(), starts, ts=[0.2], rtol=1e-6, backend="native"
         ).lanes.q_end
     )
 

@@ -79,7 +79,7 @@ def test_a_limit_cycle_has_its_period_and_multiplier_with_their_derivatives_in_a
     by_values = (values[2] - 8 * values[3] + 8 * values[4] - values[5]) / (12 * h)
     for lane in (0, 1):
         assert values[lane, 0] == pytest.approx(6.6632868593231301, abs=1e-12)
-        assert values[lane, 1] == pytest.approx(np.exp(solved.y[2, -1]), rel=1e-9)
+        assert_allclose(values[lane, 1], np.exp(solved.y[2, -1]), rtol=1e-9)
         assert_allclose(slopes[lane], by_values, rtol=1e-8)
 
 

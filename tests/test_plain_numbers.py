@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import BeadOnTurningWire
 from tolerances import ROUND_OFF
 
@@ -119,7 +120,7 @@ def test_every_builder_takes_plain_numbers_and_gives_the_same_floats(number, vec
     for name in BUILT:
         for x, y in zip(_built(name, TWO[number], THREE[vector]), right(name), strict=True):
             assert jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating), name
-            assert np.allclose(x, y, rtol=1e-6, atol=1e-6), name  # float32 stays float32
+            assert_allclose(x, y, rtol=1e-6, atol=1e-6, err_msg=name)  # float32 stays float32
 
 
 STATE_FUNCTIONS = [
@@ -149,7 +150,7 @@ def test_a_state_may_be_a_list(call):
 
     expected = f(jnp.array([0.0, 0.3]), jnp.array([1.0, 2.0]))
     for q, u in (([0, 0.3], (1, 2)), (np.array([0.0, 0.3]), np.array([1, 2]))):
-        assert np.array_equal(f(q, u), expected)
+        assert_array_equal(f(q, u), expected)
 
 
 EQUATIONS = (
@@ -217,11 +218,9 @@ def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_nu
 
     given = precision(1.3)
     value, slope = jax.value_and_grad(end)(given)
-    assert float(value) == pytest.approx(0.5 * np.cosh(0.7 * float(given)), rel=1e-10)  # r'' = rate^2 r
+    assert_allclose(float(value), 0.5 * np.cosh(0.7 * float(given)), rtol=1e-10)  # r'' = rate^2 r
     assert slope.dtype == precision
-    assert float(slope) == pytest.approx(
-        0.35 * np.sinh(0.7 * float(given)), rel=float(jnp.finfo(precision).eps)
-    )
+    assert_allclose(float(slope), 0.35 * np.sinh(0.7 * float(given)), rtol=float(jnp.finfo(precision).eps))
 
 
 @pytest.mark.parametrize("precision", [jnp.float32, jnp.bfloat16])
@@ -230,7 +229,7 @@ def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_
         return jj.simulate(Slider(), {"x": 0.0}, ts=[1.0], inputs={"push": lambda t: rate * t}).q_end[0]
 
     given = precision(1.3)
-    assert float(end(given)) == pytest.approx(
-        float(given) / 24, rel=1e-6
+    assert_allclose(
+        float(end(given)), float(given) / 24, rtol=1e-6
     )  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
-    assert float(jax.grad(end)(given)) == pytest.approx(1 / 24, rel=float(jnp.finfo(precision).eps) + 1e-6)
+    assert_allclose(float(jax.grad(end)(given)), 1 / 24, rtol=float(jnp.finfo(precision).eps) + 1e-6)

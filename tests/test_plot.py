@@ -20,7 +20,7 @@ def motions():
 
 @pytest.fixture(scope="module")
 def lanes():
-    return jj.rollout(SLEIGH, {"heading_rate": np.linspace(0.5, 2.0, 21)}, ts=TS, progress=False)
+    return jj.rollout(SLEIGH, {"heading_rate": np.linspace(0.5, 2.0, 21)}, ts=TS)
 
 
 @pytest.fixture(autouse=True)

@@ -213,7 +213,7 @@ RESULTS = {
         "Verification of ChaplyginSleigh: passed",
     ),
     "Rollout": (
-        lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN),
+        lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, **RUN),
         "Rollout of ChaplyginSleigh: 2 lanes",
     ),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),

@@ -24,7 +24,7 @@ def sleighs():
     turning = np.array([0.9, 0.5, np.nan, -0.3, 0.2, 0.7, 0.1])
     offset = np.array([0.25, 0.2, 0.25, 0.3, 0.1, np.nan, 0.2])
     starts = {"x_rate": -0.6, "heading_rate": turning}
-    options = OPTIONS | {"parameters": {"offset": offset}, "chunk": 3, "progress": False}
+    options = OPTIONS | {"parameters": {"offset": offset}, "chunk": 3}
     return turning, offset, jj.rollout(ChaplyginSleigh(), starts, **options)
 
 

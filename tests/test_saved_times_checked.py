@@ -41,7 +41,7 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
         refused(r"`ts` (runs from|must be finite and strictly)|the span from", run, start)
         for run, start in (
             (lambda x: jj.simulate(SPRING, {"x": x}, **times), 1.0),
-            (lambda x: jj.rollout(SPRING, {"x": x}, progress=False, **times), np.array([1.0, 2.0])),
+            (lambda x: jj.rollout(SPRING, {"x": x}, **times), np.array([1.0, 2.0])),
             (jax.jit(lambda x: jj.simulate(SPRING, {"x": x}, **times).q), 1.0),
         )
     }
@@ -67,7 +67,7 @@ def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_
 def test_lanes_with_times_of_their_own_are_judged_one_by_one():
     begun = np.array([0.0, 0.5, 0.6, 1.2])
     states = jax.vmap(lambda x, t: jj.start(SPRING, x=x, t0=t))(jnp.ones(4), jnp.asarray(begun))
-    lanes = jj.rollout(SPRING, states, ts=[0.5, 1.0], progress=False)
+    lanes = jj.rollout(SPRING, states, ts=[0.5, 1.0])
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
     assert np.isnan(lanes.lanes.q[2:]).all()
     assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)

@@ -24,9 +24,7 @@ TS = np.linspace(0.0, 0.5, 3)
 def discs():
     """Three discs: one rolls, one has a wrong radius, one falls."""
     starts = {"lean": np.array([0.3, 0.3, 1.4]), "spin_rate": np.array([-6.0, -6.0, -0.1])}
-    return jj.rollout(
-        TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS, progress=False
-    )
+    return jj.rollout(TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +69,7 @@ class SmallDisc(TiltingDisc):
 
 
 def test_a_class_that_looks_at_its_numbers_is_made_with_those_of_the_file(tmp_path):
-    lanes = jj.rollout(SmallDisc(radius=0.4), {"lean": np.array([0.2, 0.3])}, ts=TS, progress=False)
+    lanes = jj.rollout(SmallDisc(radius=0.4), {"lean": np.array([0.2, 0.3])}, ts=TS)
     jj.save(lanes, tmp_path / "lanes.npz")
     assert_equal_to_the_bit(jj.load_rollout(tmp_path / "lanes.npz", SmallDisc), lanes)
     jj.save(lanes.lane(1), tmp_path / "lane.npz")
@@ -79,9 +77,7 @@ def test_a_class_that_looks_at_its_numbers_is_made_with_those_of_the_file(tmp_pa
 
 
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
-    lanes = jj.rollout(
-        PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False
-    )
+    lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS)
     again = eqx.tree_at(
         lambda motions: motions.fallback, lanes.lanes, jnp.array([0, results.FULL_STATE], jnp.int32)
     )
@@ -95,7 +91,7 @@ def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path)
 def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
     inputs = {"speed": lambda t: 1.0 + t, "push": jj.Sampled([0.0, 1.0], [0.0, 2.0])}
     lanes = jj.rollout(
-        OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs, progress=False
+        OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs
     )  # in reversed time
     jj.save(lanes, tmp_path / "belt.npz")
     loaded = jj.load_rollout(tmp_path / "belt.npz", OnBelt)
