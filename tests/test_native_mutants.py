@@ -6,7 +6,6 @@ beads at constant speed; and differences.
 """
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +115,7 @@ TIMES = np.array([0.2, 0.5, 0.55, 1.3, 1.9])
 START = {"x": 0.7, "v": 0.4, "k": 4.0}
 
 
-def motion(scene: jj.Scene, values: dict, *, first: float | None = None, **options):
+def motion(scene, values, *, first=None, **options):
     """What machine code returns of a motion, and its start as a state."""
     setup = jax.tree.map(
         lambda x: x if isinstance(x, bool) else jnp.asarray(x), set_up(scene, values, work=False, **options)
@@ -262,19 +261,19 @@ def seen_by_closed_form(x):
 
 
 @functools.cache
-def expected(derivative: Callable, closed: Callable) -> dict:
+def expected(derivative, closed):
     """Derivatives of a closed form, with which machine code has nothing to do."""
     return jax.jit(derivative(closed))(AT_TIMES if closed is seen_by_closed_form else START)
 
 
-def _differentiated(mode: str, of: Callable, closed: Callable) -> None:
+def _differentiated(mode, of, closed):
     derivative = jax.jacrev if mode == "reverse" else jax.jacfwd
     found = jax.jit(lambda x: derivative(of)(x))(START)
     for name, value in expected(jax.jacfwd, closed).items():
         assert_allclose(found[name], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name}")
 
 
-def _at_saved_times(mode: str) -> None:
+def _at_saved_times(mode):
     _differentiated(mode, lambda x: WEIGHTS @ pushed(**x).ys.q[:, 0], saved_by_closed_form)
 
 
@@ -284,7 +283,7 @@ def _end(x):
     return found.t_end + 0.3 * found.y_end.v[0]
 
 
-def _at_an_event(mode: str) -> None:
+def _at_an_event(mode):
     _differentiated(mode, _end, end_by_closed_form)
 
 
@@ -304,7 +303,7 @@ def forward_mode_to_an_event():
     _at_an_event("forward")
 
 
-def _differentiated_twice(of: Callable, end: Callable, closed: Callable, at: dict) -> None:
+def _differentiated_twice(of, end, closed, at):
     found = jax.jit(of(end))(at)
     for name, row in expected(jax.hessian, closed).items():
         for other, value in row.items():
@@ -347,7 +346,7 @@ def thrown_back_by_closed_form(x):
     )
 
 
-def _through_a_transition(derivative: Callable) -> None:
+def _through_a_transition(derivative):
     (found, value), (right, right_value) = (
         with_value(derivative, f)(THROWN) for f in (_thrown_back, thrown_back_by_closed_form)
     )

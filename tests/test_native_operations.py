@@ -48,7 +48,7 @@ SPECIAL = [
 EXACT = {"neg", "sqrt", "abs", "sign", "floor", "ceil", "round", "is_finite", *TWO} - {"atan2", "pow"}
 
 
-def _all_operations() -> tuple[Graph, list[int], list[int]]:
+def _all_operations():
     graph = Graph()
     a, b = graph.input("a", True), graph.input("b", True)
     return graph, [graph.call(op, a) for op in ONE] + [graph.call(op, a, b) for op in TWO], [a, b]
@@ -178,7 +178,7 @@ def _our_own(lanes, fused, x, y):
     return dict(zip([*OWN, "x^1.5"], found.T, strict=True))
 
 
-def _arguments(op) -> tuple[np.ndarray, np.ndarray]:
+def _arguments(op):
     """Over the range in use, and near what a function does differently on either side."""
     random = np.random.default_rng(1)
     uniform = lambda low, high: random.uniform(low, high, 500)

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -59,7 +58,7 @@ def _resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _calls(kind) -> tuple[Callable, jax.Array]:
+def _calls(kind):
     """A compiled function that calls machine code, and its argument."""
     if kind == "single precision":  # converted where the call begins and ends
         graph = Graph()

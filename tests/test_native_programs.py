@@ -28,7 +28,7 @@ POINTS, INPUTS, EACH = 8, 4, 6
 Step = tuple[str, tuple[int, ...]]
 
 
-def drawn(seed) -> list[Step]:
+def drawn(seed):
     """Operations in any order, each so many times, of numbers and truth values that are there: of inputs as
     often as of what was made of them.
     """
@@ -54,7 +54,7 @@ def own_round_off(op, of_functions):
     return 0.0 if op in EXACT else EPS if op in ROUNDED else of_functions
 
 
-def true_values(steps: list[Step], point: np.ndarray, of_functions) -> list[Known | bool | None]:
+def true_values(steps, point, of_functions):
     """Of all steps."""
     known: list = [Known(mpmath.mpf(float(x)), mpmath.mpf(0)) for x in point]
     for op, args in steps:
@@ -66,7 +66,7 @@ def true_values(steps: list[Step], point: np.ndarray, of_functions) -> list[Know
 
 
 @functools.cache
-def programs(seed) -> tuple[list[Step], np.ndarray, np.ndarray, np.ndarray]:
+def programs(seed):
     """Steps of a program, points, and its values at these by machine code and by XLA."""
     steps, graph = drawn(seed), Graph()
     points = np.random.default_rng(100 + seed).normal(size=(POINTS, INPUTS)) * [1.0, 2.0, 0.5, 5.0]

@@ -21,7 +21,7 @@ BICYCLE = jj.models.WhippleBicycle()
 BACKENDS = "xla", "auto"
 
 
-def _near_rows(scene: jj.Scene, count) -> tuple[jax.Array, jax.Array]:
+def _near_rows(scene, count):
     """Coordinates and speeds a little off the rows."""
     _, q, u = jj.sample_states(scene, count)
     generator = np.random.default_rng(1)
@@ -36,7 +36,7 @@ def _put(native, held=()):
     )
 
 
-def _by_both(scene: jj.Scene, q, u, **options):
+def _by_both(scene, q, u, **options):
     """States put onto the rows by machine code and by XLA, all lanes at once."""
     return (
         eval_numpy(jax.vmap(lambda q, u, native=native: _put(native, **options)(scene, q, u)))(q, u)

@@ -27,7 +27,7 @@ ERRORS = np.sqrt(RSS / 4) * UNIT
 STUDENT, NORMAL = stdtrit(4, 0.975), 1.959964
 
 
-def run(values, sigma, unknown=BOTH, ts=TS, **options) -> jj.Experiment:
+def run(values, sigma, unknown=BOTH, ts=TS, **options):
     return jj.Experiment(ts, values, sigma, start=START, unknown_start=unknown, **options)
 
 

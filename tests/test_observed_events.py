@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
-from jourdain_jax.identification import Fit, log_density, log_likelihood
+from jourdain_jax.identification import log_density, log_likelihood
 
 
 class Stopped(Oscillator):
@@ -23,7 +23,7 @@ SCENE, SIGMA = Stopped(mass=2.0, stiffness=5.0, damping=0.0), 0.003  # s
 STOP = float(np.pi / 2 * np.sqrt(SCENE.mass / SCENE.stiffness))  # s
 
 
-def run(x0=0.3, events=None, values=None, end=1.0) -> jj.Experiment:
+def run(x0=0.3, events=None, values=None, end=1.0):
     """A run of which no more than its event is known, unless values are given at ten times a second."""
     ts = np.array([end]) if values is None else 0.1 * np.arange(1, len(values) + 1)
     events = {"buffer": (STOP + 0.002, SIGMA)} if events is None else events
@@ -31,7 +31,7 @@ def run(x0=0.3, events=None, values=None, end=1.0) -> jj.Experiment:
     return jj.Experiment(ts, seen, 0.005, start=start, t0=0.0, events=events)
 
 
-def fit(*runs, **options) -> Fit:
+def fit(*runs, **options):
     return jj.fit(SCENE.replace(mass=1.5), runs, ("mass",), rtol=1e-10, atol=1e-10, **options)
 
 

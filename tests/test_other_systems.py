@@ -8,7 +8,6 @@ import os
 import re
 import runpy
 import sys
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -233,7 +232,7 @@ def test_a_study_takes_an_empty_folder_also_where_a_folder_cannot_take_the_place
     assert [file.name for file in tmp_path.iterdir()] == ["empty"]
 
 
-def _read_as_text(tree: ast.AST) -> Iterator[ast.Call]:
+def _read_as_text(tree):
     for call in ast.walk(tree):
         if isinstance(call, ast.Call):
             # `read_text` alone is that of `calculus/files.py`

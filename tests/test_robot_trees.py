@@ -25,7 +25,7 @@ def inertial(mass, centre, I):
     )
 
 
-def possible_tensor(draw: np.random.Generator, thin) -> np.ndarray:
+def possible_tensor(draw, thin):
     """I = tr(S) 1 - S of a body turned at random, whose second moment S about one axis is `thin` beside the
     largest.
     """

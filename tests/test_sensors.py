@@ -41,9 +41,7 @@ def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=
     return gain * (lagged + rest) + bias
 
 
-def run(
-    seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers
-) -> jj.Experiment:
+def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers):
     """Place by an ideal sensor and speed by one with these `numbers`, in truth `truth`; samples before `SEEN`
     are missing from the latter.
     """
@@ -278,7 +276,7 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
     assert 0.0 < found["gyro.delay"].high < 0.02
 
 
-def late(seed, lag, delay=0.05, tau=0.05) -> jj.Experiment:
+def late(seed, lag, delay=0.05, tau=0.05):
     """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau`
     that is known or not.
     """
@@ -373,7 +371,7 @@ KNOTS = np.linspace(0.0, 4.0, 41)
 COMMAND = np.sin(2 * KNOTS) + np.where(KNOTS > 1, 0.3, 0.0)
 
 
-def pushed(sensor, actuator) -> jj.Experiment:
+def pushed(sensor, actuator):
     """The cart at rest, pushed: place and speed as simulated."""
     start, push = {"x": 0.0, "x_rate": 0.0}, {"push": jj.Sampled(KNOTS, 1.5 * COMMAND)}
     motion = jj.simulate(Cart(), start, ts=TS, inputs=push, rtol=1e-10, atol=1e-10)
@@ -401,7 +399,7 @@ def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_
 # Actuators. -------------------------------------------------------------------------------------------------
 
 
-def driven(truth, **asked) -> jj.Experiment:
+def driven(truth, **asked):
     """The cart under a command through an actuator with the numbers `truth`, of which some are asked for."""
     command = jj.Sampled(KNOTS, COMMAND)
     signal = jj.Sampled(

@@ -33,7 +33,7 @@ def address():
     server.server_close()
 
 
-def coloured(pixels: np.ndarray):
+def coloured(pixels):
     """The part of the pixels that are neither white nor grey."""
     return float(np.mean(np.ptp(pixels, axis=-1) > 0.15))
 

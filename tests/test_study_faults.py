@@ -13,7 +13,6 @@ import sys
 import time
 import warnings
 from collections import Counter, deque
-from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from itertools import combinations
@@ -392,7 +391,7 @@ def test_a_folder_that_is_moved_while_a_study_runs_is_named(tmp_path, monkeypatc
 # Every file of a folder, changed in every way that is tried: the right answer, or a named error or warning. -
 
 
-def _harms(content: bytes, generator, count) -> Iterator[tuple[str, bytes]]:
+def _harms(content, generator, count):
     """Changed contents of a file: `count` bits, twice as many digits; cut short, made longer, emptied."""
     places = generator.integers(len(content), size=count).tolist() if content else []
     put = lambda place, byte: content[:place] + bytes([byte]) + content[place + 1 :]

@@ -33,7 +33,7 @@ UNARY = [
 ]
 
 
-def coefficients(graph: Graph, s, outputs, at, known=None) -> np.ndarray:
+def coefficients(graph, s, outputs, at, known=None):
     """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them;
     `known`: values of other inputs.
     """
@@ -57,7 +57,7 @@ def coefficients(graph: Graph, s, outputs, at, known=None) -> np.ndarray:
     return np.asarray(jax.ffi.ffi_call(ffi.registered(w.text), shape)(points))[..., -1]
 
 
-def expected(f, at) -> np.ndarray:
+def expected(f, at):
     """Those by mpmath."""
     with mpmath.workdps(80):
         return np.array([float(c) for c in mpmath.taylor(f, mpmath.mpf(at), ORDER - 1)])

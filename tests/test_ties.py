@@ -19,7 +19,7 @@ TRUTH = Sleigh(mass=2.0, offset=0.25, inertia=0.25)
 TIED = {"offset": jj.bounds(0.05, 1.0), "inertia": lambda scene: 0.5 * scene.mass * scene.offset}
 
 
-def measured(seed, repeats=()) -> jj.Experiment:
+def measured(seed, repeats=()):
     motion, noise = jj.simulate(TRUTH, START, ts=TIMES), np.random.default_rng(seed)
     values = {
         name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(*repeats, TIMES.size))

@@ -57,13 +57,13 @@ class Sledge(jj.Scene):
         return jj.knife_edge(motion["sledge"], motion["sledge"].position, motion["sledge"].orientation[:, 1])
 
 
-def wrong(**methods) -> tuple[jj.Scene, jj.State]:
+def wrong(**methods):
     """The sledge with some methods replaced, and a state of it, with the bead at x = 1.1 m."""
     scene = type("Wrong", (Sledge,), methods)()
     return scene, jj.consistent(scene, 0.0, *scene.named(**scene.example)[:2], held=("bead_x",))
 
 
-def statements(scene: jj.Scene, state: jj.State) -> Verification:
+def statements(scene, state):
     """Of the verification, the part that looks at what the scene states, piece by piece: the rest takes a
     quarter of a minute to compile.
     """
@@ -73,14 +73,14 @@ def statements(scene: jj.Scene, state: jj.State) -> Verification:
     )
 
 
-def refused(found: Verification, check, culprit):
+def refused(found, check, culprit):
     """The verification failed in the named check, on the named culprit, and its text says so."""
     assert not found.passed
     lines = [line for line in str(found).splitlines() if line.startswith(f"  {check} ") and "FAILED" in line]
     assert culprit in "\n".join(lines), str(found)
 
 
-def failed(found: Verification):
+def failed(found):
     """Names of the checks that did not pass."""
     return {check.name for check in found.checks if not check.passed}
 
