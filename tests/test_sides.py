@@ -12,24 +12,20 @@ import result_codes as results
 from derivatives import with_value
 from machine_code import BACKENDS
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import OnPlane
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
 
 SPAN = 2.0
 
 
-class Bead(jj.Scene):
+class Bead(OnLine):
     """A bead of 1 kg on a line with the force `law(scene, t, x, v)`, and events of the motion."""
 
     a: float = jj.parameter(0.7)
     k: float = jj.parameter(0.5)
     law: Callable = eqx.field(static=True, default=lambda s, t, x, v: 0 * x)
     event: Callable | None = eqx.field(static=True, default=None)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
         return jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate))
@@ -193,7 +189,7 @@ def crossed(a, w, k):
 # the first lane at a tight tolerance, narrower and narrower patches at that of `simulate`
 ACROSS = np.array([[0.7, 0.03 * 0.5**k, 3.0] for k in (0, *range(9))])
 CLOSENESS = np.array([1e-12, *[jj.Options().rtol] * 9])
-CROSSED = jax.jit(jax.vmap(jax.value_and_grad(lambda p: crossed(*p))))(ACROSS)
+CROSSED = jax.jit(jax.vmap(jax.value_and_grad(lambda p: crossed(*p))))
 
 
 @pytest.mark.parametrize("kind", PATCHES)
@@ -203,9 +199,10 @@ def test_what_acts_where_several_conditions_meet_is_met(kind):
         return end(scene, {"y_rate": 0.4}, rtol=close, atol=close, solver=diffrax.Dopri8()).q_end[0]
 
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(found)))(ACROSS, CLOSENESS)
-    assert_allclose(values, CROSSED[0], rtol=0, atol=1e-7)
-    assert_allclose(values[0], CROSSED[0][0], rtol=0, atol=1e-12)
-    assert_allclose(slopes[0], CROSSED[1][0], rtol=0, atol=1e-10)
+    exact, right = CROSSED(ACROSS)
+    assert_allclose(values, exact, rtol=0, atol=1e-7)
+    assert_allclose(values[0], exact[0], rtol=0, atol=1e-12)
+    assert_allclose(slopes[0], right[0], rtol=0, atol=1e-10)
     if kind in ("one condition", "at its time"):
         forward = jax.jit(jax.jacfwd(found))(ACROSS[0], CLOSENESS[0])
         assert_allclose(forward, slopes[0], rtol=0, atol=1e-10)

@@ -27,12 +27,11 @@ def discs():
     return jj.rollout(TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS)
 
 
-@pytest.fixture(scope="module")
-def files(discs, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    jj.save(discs, folder / "rollout.npz")
-    jj.save(discs.lane(0), folder / "trajectory.npz")
-    return folder
+def kept(result, kind, folder):
+    """A motion, or several, read back from a file."""
+    jj.save(result, folder / "kept.npz")
+    read = jj.load_rollout if isinstance(result, jj.Rollout) else jj.load_trajectory
+    return read(folder / "kept.npz", kind)
 
 
 def assert_equal_to_the_bit(a, b):
@@ -42,20 +41,19 @@ def assert_equal_to_the_bit(a, b):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
-def test_a_saved_rollout_comes_back_to_the_bit_with_one_code_per_lane(discs, files):
-    loaded = jj.load_rollout(files / "rollout.npz", TiltingDisc)
+def test_a_saved_rollout_comes_back_to_the_bit_with_one_code_per_lane(discs, tmp_path):
+    loaded = kept(discs, TiltingDisc, tmp_path)
     assert discs.result.tolist() == [results.SUCCESS, results.BAD_PARAMETER, results.EVENT]
     assert_equal_to_the_bit(loaded, discs)
     assert str(loaded) == str(discs)
     assert str(loaded.lane(2)) == str(discs.lane(2))
-    with np.load(files / "rollout.npz") as file:
+    with np.load(tmp_path / "kept.npz") as file:
         header = json.loads(str(file["header"]))
         assert (header["format"], header["kind"], file["result"].tolist()) == (1, "rollout", [0, 7, 1])
 
 
 def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, tmp_path):
-    jj.save(discs.lane(1), tmp_path / "lane.npz")
-    loaded = jj.load_trajectory(tmp_path / "lane.npz", TiltingDisc)
+    loaded = kept(discs.lane(1), TiltingDisc, tmp_path)
     assert_equal_to_the_bit(loaded, discs.lane(1))
     assert loaded.message.endswith("(`radius`); check where it was computed")
 
@@ -70,10 +68,8 @@ class SmallDisc(TiltingDisc):
 
 def test_a_class_that_looks_at_its_numbers_is_made_with_those_of_the_file(tmp_path):
     lanes = jj.rollout(SmallDisc(radius=0.4), {"lean": np.array([0.2, 0.3])}, ts=TS)
-    jj.save(lanes, tmp_path / "lanes.npz")
-    assert_equal_to_the_bit(jj.load_rollout(tmp_path / "lanes.npz", SmallDisc), lanes)
-    jj.save(lanes.lane(1), tmp_path / "lane.npz")
-    assert_equal_to_the_bit(jj.load_trajectory(tmp_path / "lane.npz", SmallDisc), lanes.lane(1))
+    for result in (lanes, lanes.lane(1)):
+        assert_equal_to_the_bit(kept(result, SmallDisc, tmp_path), result)
 
 
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
@@ -82,8 +78,7 @@ def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path)
         lambda motions: motions.fallback, lanes.lanes, jnp.array([0, results.FULL_STATE], jnp.int32)
     )
     lanes = jj.Rollout(again, reruns=((results.FULL_STATE, ("full", "multipliers", "Dopri8", True, "")),))
-    jj.save(lanes, tmp_path / "chains.npz")
-    loaded = jj.load_rollout(tmp_path / "chains.npz", PendulumChain)
+    loaded = kept(lanes, PendulumChain, tmp_path)
     assert_equal_to_the_bit(loaded, lanes)
     assert (loaded.lane(0).reduction, loaded.lane(1).reduction) == (lanes.lanes.reduction, "multipliers")
 
@@ -93,8 +88,7 @@ def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
     lanes = jj.rollout(
         OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs
     )  # in reversed time
-    jj.save(lanes, tmp_path / "belt.npz")
-    loaded = jj.load_rollout(tmp_path / "belt.npz", OnBelt)
+    loaded = kept(lanes, OnBelt, tmp_path)
     assert_array_equal(loaded["x"], lanes["x"])
     for i in range(2):
         assert_allclose(jax.vmap(loaded.lane(i).inputs)(TS), jax.vmap(lanes.lane(i).inputs)(TS), rtol=1e-15)
@@ -110,8 +104,7 @@ def test_a_motion_of_equal_steps_comes_back_with_its_inputs(tmp_path):
         inputs={"speed": 1.0},
         solver=jj.ImplicitMidpoint(step=0.1),
     )
-    jj.save(steps, tmp_path / "steps.npz")
-    loaded = jj.load_trajectory(tmp_path / "steps.npz", OnBelt)
+    loaded = kept(steps, OnBelt, tmp_path)
     assert_array_equal(loaded.q, steps.q)
     assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
 
@@ -120,19 +113,8 @@ def test_a_field_that_cannot_be_stored_is_named(tmp_path):
     class Labelled(ChaplyginSleigh):
         labels: tuple = eqx.field(static=True, default=("a",))
 
-    labelled = jj.simulate(ChaplyginSleigh(), ts=TS)
-    for labels, stored in ((Labelled().labels, True), (("b",), False)):
-        motion = jj.Trajectory(
-            **{name: getattr(labelled, name) for name in labelled.__dataclass_fields__}
-            | {"scene": Labelled(labels=labels)}
-        )
-        if stored:
-            jj.save(motion, tmp_path / "labels.npz")
-            assert jj.load_trajectory(tmp_path / "labels.npz", Labelled).scene.labels == ("a",)
-        else:
-            refused(
-                r"field `labels` of `Labelled` is .*, which `save` cannot store",
-                jj.save,
-                motion,
-                tmp_path / "labels.npz",
-            )
+    motion = jj.simulate(ChaplyginSleigh(), ts=TS)
+    labelled = lambda labels: eqx.tree_at(lambda motion: motion.scene, motion, Labelled(labels=labels))
+    assert kept(labelled(Labelled().labels), Labelled, tmp_path).scene.labels == ("a",)
+    said = "field `labels` of `Labelled` is .*, which `save` cannot store"
+    refused(said, jj.save, labelled(("b",)), tmp_path / "labels.npz")

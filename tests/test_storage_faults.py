@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from refusals import refused
 from test_inputs import OnBelt
-from test_storage import assert_equal_to_the_bit
+from test_storage import assert_equal_to_the_bit, kept
 
 import jourdain_jax as jj
 
@@ -44,13 +44,10 @@ READ = {"trajectory": jj.load_trajectory, "rollout": jj.load_rollout}
 
 def rewritten(path, new, arrays=None, header=None):
     """The file with arrays and entries of the header changed, or left out where None."""
-    with np.load(path) as file:
-        kept = {name: file[name] for name in file.files}
-    head = json.loads(str(kept.pop("header"))) | (header or {})
-    kept |= {
-        "header": np.array(json.dumps({name: value for name, value in head.items() if value is not None}))
-    } | (arrays or {})
-    np.savez(new, **{name: value for name, value in kept.items() if value is not None})
+    given = lambda entries: {name: value for name, value in entries.items() if value is not None}
+    held, head = _contents(path)
+    text = np.array(json.dumps(given(head | (header or {}))))
+    np.savez(new, **given(held | {"header": text} | (arrays or {})))
     return new
 
 
@@ -218,16 +215,14 @@ def test_whatever_happens_to_a_byte_of_a_file_it_is_the_motion_or_named(saved, t
 def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
     scene = jj.models.TiltingDisc()
     start = {"lean": 0.3, "spin_rate": -3.0}
-    falls = ({"lean": 0.9}, {"t1": 5.0})
     for begin, times in (
         (start, {"t0": 1.0, "t1": 0.0}),
-        falls,
+        ({"lean": 0.9}, {"t1": 5.0}),  # it falls
         (start, {"ts": [0.3, 0.3 + 1e-15, 0.7]}),
         (start, {"ts": [0.5]}),
     ):
         motion = jj.simulate(scene, begin, **times)
-        jj.save(motion, tmp_path / "motion.npz")
-        assert_equal_to_the_bit(jj.load_trajectory(tmp_path / "motion.npz", type(scene)), motion)
+        assert_equal_to_the_bit(kept(motion, type(scene), tmp_path), motion)
 
 
 def changed(**parameters):
