@@ -154,6 +154,8 @@ def test_numbers_in_single_precision_give_what_they_give_by_xla():
             )
 
 
+# on machines that do not round products and sums together, one after the other alone
+either = pytest.mark.parametrize("fused", [True, False][not host.fuses() :])
 GROWING = ("exp", "exp2", "expm1", "sinh", "cosh", "logistic")
 OWN = ["sin", "cos", *BY_POLYNOMIALS]
 
@@ -224,11 +226,9 @@ def _arguments(op):
     return x[inside], y[inside]
 
 
-@pytest.mark.parametrize("fused", [True, False])
+@either
 @pytest.mark.parametrize("op", [*OWN, "x^1.5"])
 def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
-    if fused and not host.fuses():
-        pytest.skip("sums and products are rounded one after the other here")
     x, y = _arguments(op)
     found = _our_own(host.lanes(), fused, x, y)[op]
     function = (lambda x: mpmath.sqrt(x) * x) if op == "x^1.5" else in_mpmath(op)
@@ -242,10 +242,8 @@ def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
     assert max(errors) < 0.9  # ulp
 
 
-@pytest.mark.parametrize("fused", [True, False])
+@either
 def test_functions_of_our_own_are_the_same_beside_any_others(fused):
-    if fused and not host.fuses():
-        pytest.skip("sums and products are rounded one after the other here")
     random = np.random.default_rng(2)
     spread = random.normal(size=400) * 10.0 ** random.integers(-5, 7, size=400)
     x = np.concatenate([SPECIAL, [1e-310, -1e-310], spread])

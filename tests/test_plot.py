@@ -36,6 +36,10 @@ def overlap(figure, *artists):
     return any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[k + 1 :])
 
 
+def texts(legend):
+    return [text.get_text() for text in legend.get_texts()]
+
+
 UNITS = {"heading": ("deg", 180 / np.pi), "heading_rate": ("rpm", 30 / np.pi), "x": ("cm", 100.0)}
 UNITS |= {"x_rate": ("km/h", 3.6), "energy": ("mJ", 1000.0)}
 
@@ -74,7 +78,7 @@ def test_several_motions_lie_in_one_figure_with_their_labels(motions):
         for line, motion in zip(axis.lines, motions, strict=True):
             assert_array_equal(line.get_ydata(), motion[name])
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["slow", "fast"]
+    assert texts(legend) == ["slow", "fast"]
     assert not overlap(figure, legend, axes[0].title, *axes)
 
 
@@ -87,11 +91,7 @@ def test_of_a_rollout_bands_hold_the_parts_that_are_asked_for(lanes):
         at_end = band[np.isclose(band[:, 0], 1.0), 1]
         expected = np.rad2deg(np.quantile(lanes["heading"][:, -1], [(1 - part) / 2, (1 + part) / 2]))
         assert_allclose([at_end.min(), at_end.max()], expected, atol=1e-9)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "90 % of samples",
-        "50 % of samples",
-        "median",
-    ]
+    assert texts(figure.legends[0]) == ["90 % of samples", "50 % of samples", "median"]
     assert axes[0].get_title(loc="left") == "21 samples; 0 stopped at an event, 0 failed"
     assert not overlap(figure, figure.legends[0], axes[0].title, *axes)
 
@@ -102,7 +102,7 @@ def test_rollouts_and_motions_share_a_figure_and_the_axes_of_a_user(lanes, motio
     assert figure is own
     assert list(axes) == list(panels)
     assert [line.get_label() for line in panels[0].lines] == ["many, median", "one"]
-    assert [text.get_text() for text in panels[0].get_legend().get_texts()] == ["many, median", "one"]
+    assert texts(panels[0].get_legend()) == ["many, median", "one"]
     with plt.rc_context({"svg.fonttype": "none"}):  # text as text
         jj.plot(motions, "x", path=tmp_path / "two.svg")
     written = (tmp_path / "two.svg").read_text()

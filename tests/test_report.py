@@ -25,6 +25,11 @@ from jourdain_jax.models import (
 )
 
 
+def words(found):
+    """What is printed, on one line."""
+    return " ".join(str(found).split())
+
+
 class SkateTwice(Skate):
     """The row of the edge stated twice: by the body and by the coordinates."""
 
@@ -54,7 +59,7 @@ def test_the_report_on_the_free_axle_says_what_the_paper_says_and_more():
     assert found.closed
     assert found.holonomic_rows_together == 8
     assert not found.rheonomic
-    text = " ".join(str(found).split())
+    text = words(found)
     for phrase in ("(2, 3, 4), closed", "taken together: 8", "manifold of dimension 4", "freedom 2"):
         assert phrase in text
 
@@ -92,7 +97,7 @@ class Roller(jj.Scene):
 def test_rows_that_follow_from_the_others_in_another_way_at_each_configuration_are_counted():
     found = report(Roller())
     assert (len(found.rows), found.rank, found.redundant_rows) == (4, 3, ())
-    assert "1 at each configuration, but not the same everywhere" in " ".join(str(found).split())
+    assert "1 at each configuration, but not the same everywhere" in words(found)
 
 
 def test_privileged_speeds_may_stand_in_one_text():
@@ -133,18 +138,18 @@ def test_relations_that_the_rates_contain_are_no_rows():
     assert found.growth_vector == (1,)
     assert found.holonomic_rows_together == 0
     assert "taken together" not in str(found)
-    assert "(1), closed; the motion stays on a manifold of dimension 1" in " ".join(str(found).split())
+    assert "(1), closed; the motion stays on a manifold of dimension 1" in words(found)
 
 
 def test_a_scene_without_freedom_says_so_and_nothing_of_conditioning():
-    text = " ".join(str(report(Held())).split())
+    text = words(report(Held()))
     assert "growth vector (0), no freedom left" in text
     assert "their conditioning nothing to choose, no freedom left" in text
 
 
 def test_the_report_tells_stop_events_domain_and_conventions():
     found = report(Drifting())
-    text = " ".join(str(found).split())
+    text = words(found)
     assert "events 1: off the belt" in text
     assert "probed in y -1 to 2; otherwise coordinates -3.2 to 3.2, speeds -1 to 1" in text
     assert "conventions x along the belt." in text

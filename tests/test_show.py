@@ -57,9 +57,9 @@ def shown(motion):
     return jj.show(motion, title="Ball & rope", colours={"ball": RED})
 
 
-def contents(page):
+def contents(shown):
     """Description and numbers of a page."""
-    held = dict(re.findall(r'<script id="(\w+)"[^>]*>(.*?)</script>', page, re.DOTALL))
+    held = dict(re.findall(r'<script id="(\w+)"[^>]*>(.*?)</script>', shown.html, re.DOTALL))
     floats = np.frombuffer(zlib.decompress(base64.b64decode(held["numbers"])), "<f4")
     return json.loads(held["scene"]), lambda at: floats[at[0] : at[0] + at[1]]
 
@@ -70,7 +70,7 @@ def matrix(q):
 
 
 def test_a_page_holds_the_poses_that_the_scene_has(motion, shown):
-    page, numbers = contents(shown.html)
+    page, numbers = contents(shown)
     assert page["title"] == "Ball & rope"
     assert "<title>Ball &amp; rope</title>" in shown.html
     assert page["names"] == [{"name": "ball", "colour": RED}]
@@ -123,9 +123,7 @@ def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
                 motion["ball"].point(), jnp.stack([0.0, 0.0, -1.0]) * blow
             )
 
-    page, numbers = contents(
-        jj.show(jj.simulate(Struck(), Struck.example, ts=jnp.linspace(0.0, 2.0, 41))).html
-    )
+    page, numbers = contents(jj.show(jj.simulate(Struck(), Struck.example, ts=jnp.linspace(0.0, 2.0, 41))))
     (force,) = page["motions"][0]["forces"]
     lengths = np.linalg.norm(numbers(force["vectors"]).reshape(-1, 3), axis=1)
     weight = 2.0 * 9.81
@@ -156,11 +154,11 @@ def test_whole_turns_between_saved_times_are_kept():
 def test_lanes_and_lists_lie_over_one_another():
     sleigh, turning = jj.models.ChaplyginSleigh(), {"heading_rate": np.linspace(0.5, 2.0, 20)}
     lanes = jj.rollout(sleigh, turning, ts=np.linspace(0, 0.5, 5))
-    page, _ = contents(jj.show(lanes).html)
+    page, _ = contents(jj.show(lanes))
     assert len(page["motions"]) == 12
-    page, _ = contents(jj.show([lanes.lane(0), lanes.lane(7)], follow=True).html)
+    page, _ = contents(jj.show([lanes.lane(0), lanes.lane(7)], follow=True))
     assert (len(page["motions"]), page["follow"]) == (2, True)
-    page, _ = contents(jj.show(lanes.lane(3), paths=[("sleigh", (0.1, 0, 0))]).html)
+    page, _ = contents(jj.show(lanes.lane(3), paths=[("sleigh", (0.1, 0, 0))]))
     assert len(page["motions"][0]["paths"]) == 1
 
 
@@ -193,7 +191,7 @@ def test_bodies_are_guessed_from_contacts_lines_and_inertias():
 def test_every_model_is_shown_with_shapes_on_its_ground(name):
     scene = jj.models.model(name)
     motion = jj.simulate(scene, scene.example, ts=jnp.linspace(0.0, 0.2, 3))
-    page, _ = contents(jj.show(motion).html)
+    page, _ = contents(jj.show(motion))
     shapes = {body["name"]: len(body["shapes"]) for body in page["motions"][0]["bodies"]}
     assert all(shapes.values())
     assert set(motion.motions().bodies) <= set(shapes)
@@ -212,7 +210,7 @@ def test_every_model_is_shown_with_shapes_on_its_ground(name):
 def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
     ball = Rolls(radius=0.1, make_ground=lambda scene, pose: make())
     motion = jj.simulate(ball, {"x": 0.05, "x_rate": 0.1}, ts=jnp.linspace(0.0, 0.3, 3))
-    page, numbers = contents(jj.show(motion).html)
+    page, numbers = contents(jj.show(motion))
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)
     assert corners[:, 2].min() == pytest.approx(lowest, abs=2e-3)
@@ -255,7 +253,7 @@ def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path
 def test_a_floor_is_drawn_under_what_has_weight_alone():
     free, pendulum = jj.models.FreeRigidBody(), jj.models.DoublePendulumAngles()
     grounds = [
-        contents(jj.show(jj.simulate(scene, scene.example, t1=0.5)).html)[0]["grounds"]
+        contents(jj.show(jj.simulate(scene, scene.example, t1=0.5)))[0]["grounds"]
         for scene in (free, pendulum)
     ]
     assert [len(found) for found in grounds] == [0, 1]
@@ -301,7 +299,7 @@ def test_a_mesh_in_the_visuals_of_a_scene_is_drawn_with_its_body(tmp_path):
             return {"part": jj.Visual.from_file(tmp_path / "part.stl", scale=0.001)}
 
     motion = jj.simulate(Falling(), {"z": 1.0, "z_rate": -1.0}, ts=jnp.linspace(0.0, 1.0, 3))
-    page, numbers = contents(jj.show(motion).html)
+    page, numbers = contents(jj.show(motion))
     (part,) = page["motions"][0]["bodies"]
     (shape,) = part["shapes"]
     drawn = numbers(shape["mesh"]).reshape(-1, 3)

@@ -33,27 +33,33 @@ rtol = 1e-6
 pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
-def test_a_study_runs_from_a_file_goes_on_and_is_exported(tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """The command, where the file is."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "discs.toml").write_text(FILE)
-    assert main(["sweep", "discs.toml", "--shard", "1/2", "--quiet"]) == 0
+    return lambda *words: main(["sweep", *words])
+
+
+def test_a_study_runs_from_a_file_goes_on_and_is_exported(sweep, capsys):
+    assert sweep("discs.toml", "--shard", "1/2", "--quiet") == 0
     assert "64 of 100 samples; run it again to continue" in capsys.readouterr().out
-    assert main(["sweep", "status", "discs.zarr", "--json"]) == 1  # not complete
+    assert sweep("status", "discs.zarr", "--json") == 1  # not complete
     assert json.loads(capsys.readouterr().out)["complete"] is False
-    assert main(["sweep", "resume", "discs.zarr", "--quiet"]) == 0
-    assert main(["sweep", "status", "discs.zarr", "--json"]) == 0
+    assert sweep("resume", "discs.zarr", "--quiet") == 0
+    assert sweep("status", "discs.zarr", "--json") == 0
     capsys.readouterr()
-    assert main(["sweep", "status", "discs.zarr", "--json"]) == 0
+    assert sweep("status", "discs.zarr", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["counts"] == {"success": 100}
     low, high = found["outputs"]["final lean"]["quantiles"]["0.5"]
     assert low < found["outputs"]["final lean"]["mean"] + 0.1
     assert high > found["outputs"]["final lean"]["mean"] - 0.1
-    assert main(["sweep", "export", "discs.zarr"]) == 0
+    assert sweep("export", "discs.zarr") == 0
     with xarray.open_dataset("discs.nc") as arrays:
         assert arrays.sizes["lane"] == 100
         assert arrays.attrs["parameters"].startswith("{'mass': {'value': 2.0")
-    assert main(["sweep", "discs.toml", "--out", "discs.nc", "--quiet"]) == 2
+    assert sweep("discs.toml", "--out", "discs.nc", "--quiet") == 2
     assert "is a file" in capsys.readouterr().err
 
 
@@ -152,22 +158,18 @@ def test_whatever_stands_in_a_file_is_taken_or_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("shard", ["1", "0/2", "3/2", "1_0/20", "a/b", "\u0661/2", "1/" + "9" * 5000])
-def test_a_shard_is_two_whole_numbers(shard, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "discs.toml").write_text(FILE)
-    assert main(["sweep", "discs.toml", "--shard", shard]) == 2
+def test_a_shard_is_two_whole_numbers(shard, sweep, capsys):
+    assert sweep("discs.toml", "--shard", shard) == 2
     assert "--shard" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     "error", [RuntimeError("workers died 3 times on lanes 0 to 31"), MemoryError("a process holds 900 MB")]
 )
-def test_a_study_that_stops_says_why_in_one_line(error, tmp_path, monkeypatch, capsys):
+def test_a_study_that_stops_says_why_in_one_line(error, sweep, monkeypatch, capsys):
     def stops(*_):
         raise error
 
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run.Runner, "run_block", stops)
-    (tmp_path / "discs.toml").write_text(FILE)
-    assert main(["sweep", "discs.toml", "--quiet"]) == 1
+    assert sweep("discs.toml", "--quiet") == 1
     assert capsys.readouterr().err == f"jourdain-jax: {error}\n"
