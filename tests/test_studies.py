@@ -120,8 +120,7 @@ def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     values = [np.delete(arrays[name].values, BAD) for name in ("final lean", "distance")]
     assert_allclose(whole.statistics.covariance[0, 4], np.cov(*values)[0, 1], rtol=1e-9)
     assert f"failed: samples {BAD}" in str(whole)
-    with pytest.raises(ValueError, match="radius"):
-        whole.lane(BAD).simulate()
+    refused("radius", lambda: whole.lane(BAD).simulate())
 
 
 def test_the_folder_opens_in_xarray_with_names_units_and_what_was_asked(whole):
@@ -195,7 +194,9 @@ def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(wh
 
 
 def test_an_output_that_is_no_number_or_unknown_is_named(whole, tmp_path):
-    with pytest.raises(ValueError, match="expected one real number for a motion"):
-        discs().run(tmp_path / "discs.zarr", outputs={"all": lambda motion: motion.q_end}, **ASKED)
+    refused(
+        "expected one real number for a motion",
+        lambda: discs().run(tmp_path / "discs.zarr", outputs={"all": lambda motion: motion.q_end}, **ASKED),
+    )
     refused("no output `lean`", whole.mean, "lean")
     refused("`cells` is 0", whole.histogram, "final lean", 0)
