@@ -5,7 +5,6 @@ a constant where it is a class or a module.
 import copy
 import functools
 import gc
-import importlib
 import pickle
 import weakref
 
@@ -20,6 +19,10 @@ from small_scenes import OnLine
 import jourdain_jax as jj
 
 GAIN = 1.0
+IMPORTS = """
+import argparse, array, collections, contextvars, dataclasses, enum, fractions, functools, itertools, random
+import types
+"""
 SPRING = """
 class Spring(jj.Scene):
     coordinates = jj.coordinates("x")
@@ -43,21 +46,7 @@ def cell(text, read, before="pass"):
     `before`: a line of the method before that.
     """
     names = {"jj": jj, "jnp": jnp, "np": np, "__name__": "__main__"}
-    modules = (
-        "argparse",
-        "array",
-        "collections",
-        "contextvars",
-        "dataclasses",
-        "enum",
-        "fractions",
-        "functools",
-        "itertools",
-        "random",
-        "types",
-    )
-    names |= {name: importlib.import_module(name) for name in modules}
-    exec(text, names)
+    exec(IMPORTS + text, names)
     exec(SPRING.format(read=read, before=before), names)
     return names
 
