@@ -18,6 +18,7 @@ import jourdain_jax as jj
 from jourdain_jax.calculus import progress
 from jourdain_jax.kernels import ffi, host
 
+root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand files to another user")
 OTHER = 12345  # the number of another user
 
 
@@ -116,7 +117,7 @@ def test_a_folder_that_others_may_write_is_not_used(folder, mode):
     assert host.kept("a", "llvm 20", _never) == right[0]
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a file to another user")
+@root
 def test_a_file_that_another_user_put_there_is_made_again(folder):
     right = _all_kept("a")
     file = folder / "a.o"
@@ -138,7 +139,7 @@ def test_a_link_or_a_pipe_in_place_of_a_file_is_not_read(folder, tmp_path):
     assert _all_kept("a") == right
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a folder to another user")
+@root
 @pytest.mark.parametrize("place", ["JOURDAIN_JAX_CACHE", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"])
 def test_the_owner_is_asked_of_every_folder(tmp_path, monkeypatch, place):
     """Of JAX's shared cache and of the user's too."""

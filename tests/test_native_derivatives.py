@@ -118,7 +118,8 @@ def _largest_record(memory, lanes):
 
 @pytest.mark.parametrize("lanes", [1, 11])
 def test_records_of_reverse_mode_keep_to_the_memory_of_the_model(monkeypatch, lanes):
-    llvm = pytest.importorskip("llvmlite.binding")
+    from llvmlite import binding as llvm
+
     monkeypatch.setenv("JOURDAIN_JAX_THREADS", "1")
     llvm.add_symbol("aligned_alloc", ctypes.cast(_counted, ctypes.c_void_p).value)
     try:

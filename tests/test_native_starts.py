@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import linkages
+import machine_code
 import numpy as np
 import pytest
 import rolling_scenes
@@ -10,12 +11,11 @@ import small_scenes
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
-from jourdain_jax.kernels import ffi
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.program.eager import eval_numpy
 
-pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
+pytestmark = machine_code.needed
 
 BICYCLE = jj.models.WhippleBicycle()
 BACKENDS = "xla", "auto"

@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
-import pytest
 import result_codes as results
 from numpy.testing import assert_allclose
 from refusals import refused
@@ -11,15 +11,12 @@ from refusals import refused
 import jourdain_jax as jj
 from jourdain_jax.equations.projection import BY_AUTODIFF
 from jourdain_jax.integrate.constraint_projection import row_functions
-from jourdain_jax.kernels import ffi
 from jourdain_jax.program import interpret
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.structure.row_program import row_program
 
-needs_llvmlite = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against() or "-")
 
-
-@needs_llvmlite
+@machine_code.needed
 def test_rows_of_a_large_scene_have_the_derivatives_of_the_scenes_own():
     """Machine code returns the nonzero entries: a whole Jacobian goes beyond the end of its stack."""
     scene, generator = jj.models.TrailerChain(trailers=16), np.random.default_rng(0)

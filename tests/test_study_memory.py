@@ -8,15 +8,11 @@ from refusals import refused
 from test_study_faults import run, study
 
 import jourdain_jax as jj
-from jourdain_jax.studies import End, memory, outputs
+from jourdain_jax.studies import End, memory
 from jourdain_jax.studies.statistics import Tally
 
+pytestmark = pytest.mark.usefixtures("small_blocks")
 TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
-
-
-@pytest.fixture(autouse=True)
-def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(outputs, "LARGEST_BLOCK", 32)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +118,6 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
     ):
         run(tmp_path / "discs.zarr", memory=bound)
     monkeypatch.undo()
-    monkeypatch.setattr(outputs, "LARGEST_BLOCK", 32)
     assert run(tmp_path / "discs.zarr").complete
 
 
