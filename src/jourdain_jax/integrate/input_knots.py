@@ -13,26 +13,21 @@ time and knot times from the line on its own side (`SeenFromWithin`), so that en
 the knots.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import PerLane, PerTime, largest
 from jourdain_jax.integrate.inputs import Inputs, Sampled
 
 
-def knots_between(holders: PyTree, rtol, t0, t1, ts: PerTime) -> Float[Array, "knots"] | None:
-    """Return the knots of all `Sampled` in `holders` at which steps must end: times since `t0`, in the order
-    of the motion, excluding the times `ts`. At least one infinite time follows. None if there are no samples.
+def knots_between(samples: Sequence[Sampled], rtol, t0, t1, ts: PerTime) -> Float[Array, "knots"]:
+    """Return the knots of `samples` at which steps must end: times since `t0`, in the order of the motion,
+    excluding the times `ts`. At least one infinite time follows.
     """
-    samples = [
-        x
-        for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled))
-        if isinstance(x, Sampled) and len(x.ts) > 1
-    ]
-    if not samples:
-        return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
     direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
     # tolerance of the polygon, relative to the range of values; times closer than 1e-12 of the span coincide

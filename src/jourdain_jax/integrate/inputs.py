@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.compilation import compiled
 from jourdain_jax.calculus.jumps import jumps
@@ -192,6 +192,12 @@ class Sampled(eqx.Module):
     def __call__(self, t):
         """Return the value at time t."""
         return jnp.interp(t, self.ts, self.values)
+
+
+def samples_in(tree: PyTree) -> list[Sampled]:
+    """Return all `Sampled` in a tree."""
+    found = jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, Sampled))
+    return [x for x in found if isinstance(x, Sampled)]
 
 
 class Constant(eqx.Module):

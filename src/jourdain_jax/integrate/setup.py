@@ -19,6 +19,7 @@ from jourdain_jax.integrate.constraint_projection import Usual
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.input_knots import knots_between
+from jourdain_jax.integrate.inputs import samples_in
 from jourdain_jax.integrate.state_projection import State
 from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
@@ -176,7 +177,9 @@ class Setup(NamedTuple):  # a NamedTuple, because making an Equinox module takes
     @property
     def knots(self) -> Float[Array, "knots"] | None:
         """Return the sample times at which steps must end, measured from the start."""
-        return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
+        samples = [x for x in samples_in((self.inputs, self.scene)) if len(x.ts) > 1]
+        times = self.t0, self.t1, self.ts
+        return knots_between(samples, self.tolerances[0], *times) if samples else None
 
 
 class Plain(NamedTuple):

@@ -34,6 +34,7 @@ from jourdain_jax.structure.structure import (
     Reference,
     Structure,
     check_bodies,
+    is_judged,
     structure_of,
     structure_whatever_its_faults,
 )
@@ -335,9 +336,9 @@ def build(
     impossible bodies, or if formulation or backend do not suit the scene.
     """
     scene = as_scene(scene)
-    check_bodies(scene)  # raises an error for an invalid scene
     model = modelled(scene, formulation, backend)
-    model.usual(False), model.usual(True), model.way
+    model.once("possible", lambda: check_bodies(scene))  # raises an error for an invalid scene
+    model.once("judged", lambda: is_judged(scene)), model.usual(False), model.usual(True), model.way
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
     settled = Model(
         scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory)

@@ -41,6 +41,7 @@ class RowProgram:
 
     graph: Graph
     parameters: tuple[Indices, ...]  # of each leaf of the scene, by entry; -1 for unused ones
+    entries: Indices  # of all entries of parameters that the program uses
     t: int
     q: Indices
     u: Indices
@@ -54,11 +55,6 @@ class RowProgram:
     others: (
         Indices  # coordinates of other states, on the geometric constraints, on which `right` also depends
     )
-
-    @property
-    def entries(self) -> list[int]:
-        """Return the nodes of all entries of parameters that the program uses."""
-        return [n for leaf in self.parameters for n in leaf if n >= 0]
 
 
 @once_per_class
@@ -94,7 +90,9 @@ def row_program(scene: Scene) -> RowProgram | None:
         name: tuple(x) if isinstance(x, list) else x
         for name, x in jax.tree.map(lambda n: int(place[n]), parts).items()
     }
-    return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
+    parameters = tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters)
+    entries = tuple(n for leaf in parameters for n in leaf if n >= 0)
+    return RowProgram(own, parameters, entries, **listed)
 
 
 def _right(scene: Scene, looked: LookedAt, A: Matrix, M: Matrix | None) -> tuple[list[int], list[int]]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from jourdain_jax.calculus.markers import entries_of, stopped
 from jourdain_jax.calculus.reals import Indices, PerTime, Scalar, real_type
 from jourdain_jax.integrate.explicit_steps import Method
-from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
+from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled, samples_in
 from jourdain_jax.integrate.loop import taylor
 from jourdain_jax.integrate.loop.adjoint import flow_back, moved, rates_of_all
 from jourdain_jax.integrate.loop.form import Form
@@ -54,7 +54,7 @@ def reason_against(
         return "the scene has no scalar program"
     if reason := ffi.reason_against():
         return reason
-    if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
+    if samples_in(scene):
         return "the scene itself has a sampled input"
     if not all(
         isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels
