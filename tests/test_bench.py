@@ -42,6 +42,7 @@ from jourdain_jax.equations import coordinate_rates
 SHORT = {
     "antiparallelogram": (0, 7, 14),
     "rod-pendulum": (3, 10, 17, 24),
+    "disc, plane, moreau": (2, 14),
     "room": (5, 12, 19),
     "grazing": (0, 7, 14),
     "stop-arcsine": (0, 7),
