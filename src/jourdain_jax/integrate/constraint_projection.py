@@ -9,16 +9,19 @@ two calls of machine code.
                                  J: derived on the graph (`integrate/loop/value_kernels.py`)
 """
 
+from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.derivatives import differentiated_as, with_derivatives_of
+from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import (
     Entries,
     PerCoordinate,
@@ -33,7 +36,7 @@ from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.integrate.loop import projection_kernel
 from jourdain_jax.integrate.loop.projection_kernel import Rows, write
-from jourdain_jax.integrate.loop.value_kernels import called, entries, values_of_nodes
+from jourdain_jax.integrate.loop.value_kernels import called, entries, nodes_called, values_of_nodes
 from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.scene.scene import Scene
@@ -163,6 +166,26 @@ def _put(rows: Rows, scenes: tuple[Scene, ...], *vectors) -> tuple[Array, Array]
     real, given = real_type(), (*entries(scenes[-1], rows.program.parameters), *vectors)
     found = _kernel(rows, real)(tuple(jnp.asarray(x, real) for x in given))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
+
+
+class Validity(NamedTuple):
+    """The truth values `RowProgram.right`, by machine code."""
+
+    others: int  # number of coordinates of other states
+    at: Callable[..., Bool[Array, "3"]]  # function of the scene, t, q, u, inputs and these coordinates
+
+
+@lru_cache(maxsize=64)
+def validity(program: RowProgram) -> Validity | None:
+    """Return the validity of a start; None if machine code cannot evaluate it."""
+    if unsupported(program.graph, program.right):
+        return None
+    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    values = nodes_called(program.graph, program.right, given)
+    return Validity(
+        len(program.others),
+        lambda scene, *state: values(*stopped((*entries(scene, program.parameters), *state))) > 0,
+    )
 
 
 @lru_cache(maxsize=64)

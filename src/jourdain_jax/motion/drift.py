@@ -87,18 +87,11 @@ def energy_lost(at: Float[Array, "times 2"], near: Float[Array, "times 2"], step
     """Return whether T + V changed by more than the errors of `steps` steps can explain. `at`, `near`: the
     two results of `energies_near`.
     """
-    kinetic, potential = at.T
     errors = jnp.abs(near - at) + eps_of(at) * jnp.abs(at)
-    numbers = kinetic, potential, kinetic + potential
-    # one reduction, which XLA compiles to one kernel
-    every = [
-        jnp.where(jnp.isnan(x), -jnp.inf, x)
-        for x in (*numbers, *(-x for x in numbers), errors[:, 0] + errors[:, 1])
-    ]
-    most = jax.lax.reduce(
-        every, [jnp.array(-jnp.inf, at.dtype)] * 7, lambda x, y: list(map(jnp.maximum, x, y)), (0,)
-    )
-    of_potential, of_energy = most[1] + most[4], most[2] + most[5]  # ranges
+    energy, error = at[:, :1] + at[:, 1:], errors[:, :1] + errors[:, 1:]
+    every = jnp.concatenate([at, -at, energy, -energy, error], axis=1)
+    most = jnp.max(jnp.where(jnp.isnan(every), -jnp.inf, every), axis=0)
+    of_potential, of_energy = most[1] + most[3], most[4] + most[5]  # ranges
     allowed = diagnostics.DRIFTED * (most[0] + of_potential), MOST_STEP_ERRORS * steps * most[6]
     return of_energy > jnp.maximum(*allowed)
 

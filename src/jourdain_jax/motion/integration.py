@@ -20,6 +20,7 @@ from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
+from jourdain_jax.integrate.constraint_projection import validity
 from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, for_programs, in_phases
 from jourdain_jax.integrate.loop import value_kernels
@@ -27,7 +28,6 @@ from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
 from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant
-from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.motion.drift import (
     MOST_STEP_ERRORS,
     conserves,
@@ -264,23 +264,16 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
-    program = None if program is None or unsupported(program.graph, program.right) else program
-    unneeded = setup.judged or (program is not None and not program.others)
-    others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, program is not None)
-    if program is None:
+    valid = None if program is None else validity(program)
+    unneeded = setup.judged or (valid is not None and not valid.others)
+    others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, valid is not None)
+    if valid is None:
         faults = faults_at(scene, *at, others, not setup.integrator.tried)
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
     else:
-        nowhere = np.full(len(program.others), jnp.nan)
-        parts = (
-            *value_kernels.entries(scene, program.parameters),
-            *at,
-            nowhere if unneeded else others.ravel(),
-        )
-        given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
-        found = value_kernels.nodes_called(program.graph, program.right, given)(*stopped(parts))
-        right, possible, finite = found > 0
+        nowhere = np.full(valid.others, jnp.nan)
+        right, possible, finite = valid.at(scene, *at, nowhere if unneeded else others.ravel())
         right = right & (possible | setup.integrator.tried)
     fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
     code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
