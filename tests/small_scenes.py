@@ -5,6 +5,11 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 
+def name_of(given):
+    """The name of a scene's class, by which cases of tests are called; none of what is no scene."""
+    return type(given).__name__ if isinstance(given, jj.Scene) else ""
+
+
 class OnLine(jj.Scene):
     """A mass on the x axis, of 1 kg where a scene states no other."""
 

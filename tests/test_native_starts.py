@@ -117,7 +117,7 @@ def test_lanes_that_are_no_numbers_and_those_that_run_away():
         (small_scenes.AffineRows(), 1e-11),
         (rolling_scenes.RouthSphere(), 1e-11),
     ],
-    ids=lambda given: type(given).__name__ if isinstance(given, jj.Scene) else "",
+    ids=small_scenes.name_of,
 )
 def test_rows_that_depend_on_each_other_on_time_and_redundant_coordinates(scene, tolerance):
     ours, theirs = _by_both(scene, *_near_rows(scene, 7))
@@ -161,7 +161,7 @@ class Driven(jj.Scene):
         return {"edge": rod.velocity @ rod.orientation[:, 1] - motion.inputs.turn * self.length}
 
 
-@pytest.mark.parametrize("scene", [Driven(), BICYCLE], ids=lambda scene: type(scene).__name__)
+@pytest.mark.parametrize("scene", [Driven(), BICYCLE], ids=small_scenes.name_of)
 def test_derivatives_of_starts_are_those_by_xla(scene):
     (q,), (u,) = _near_rows(scene, 1)
     point = jax.tree.map(lambda x: jnp.asarray(x, float), scene), q, u

@@ -43,7 +43,7 @@ CASES = {
     "driven, by Taylor series": (Driven(), None, {"solver": jj.Taylor()}),
     "disc that falls": (DISC, {"lean": 0.6, "spin_rate": -0.1}, {}),
     "disc with a quaternion, projected": (
-        jj.models.MODELS["tilting-disc-quaternion"](),
+        jj.models.TiltingDiscQuaternion(),
         None,
         {"formulation": jj.Formulation("full"), "events": False},
     ),

@@ -51,7 +51,7 @@ SCENES = [
 ]
 
 
-@pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("scene", SCENES, ids=small.name_of)
 def test_energy_changes_by_the_power_of_what_has_no_potential(scene):
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 20)]
     rate, supplied, size = eval_numpy(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(
@@ -90,7 +90,7 @@ def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
         ),
         (TIMED[4][0], ("masses or inertias that change",)),
     ],
-    ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else "",
+    ids=small.name_of,
 )
 def test_what_changes_the_energy_of_a_scene_is_named(scene, changed_by):
     balance = jj.analysis.energy_balance(scene)

@@ -11,7 +11,7 @@ import jourdain_jax as jj
 from jourdain_jax import structure_of
 
 
-class Called(jj.models.MODELS["chaplygin-sleigh"]):
+class Called(jj.models.ChaplyginSleigh):
     """A sleigh with friction that asks Python, which has no derivative."""
 
     def loads(self, motion):
@@ -48,7 +48,7 @@ def test_what_a_call_in_a_pose_does_not_do_is_known():
 
 
 def test_a_callback_in_a_load_changes_nothing_else():
-    expected, found = structure_of(jj.models.MODELS["chaplygin-sleigh"]()), structure_of(Called())
+    expected, found = structure_of(jj.models.ChaplyginSleigh()), structure_of(Called())
     assert (found.rank, found.independent, found.row_names) == (
         expected.rank,
         expected.independent,
@@ -58,7 +58,7 @@ def test_a_callback_in_a_load_changes_nothing_else():
 
 
 def test_a_pose_that_jax_cannot_differentiate_is_named():
-    class Asked(jj.models.MODELS["chaplygin-sleigh"]):
+    class Asked(jj.models.ChaplyginSleigh):
         def velocity_constraints(self, motion):
             turn = jax.pure_callback(
                 np.sin,
@@ -80,7 +80,7 @@ def test_a_derivative_rule_in_the_rates_of_coordinates_is_believed():
 
     doubled.defjvp(lambda x, dx: (x[0], 2 * dx[0]))
 
-    class Believed(jj.models.MODELS["chaplygin-sleigh"]):
+    class Believed(jj.models.ChaplyginSleigh):
         def coordinate_rates(self, t, q, u):
             return doubled(u.array)
 

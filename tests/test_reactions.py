@@ -34,7 +34,7 @@ SCENES = [
 ]
 
 
-@pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("scene", SCENES, ids=small.name_of)
 def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene):
     @eval_numpy
     @jax.vmap

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import OnLine, OnPlane
+from small_scenes import OnLine, OnPlane, name_of
 
 import jourdain_jax as jj
 from jourdain_jax import report
@@ -161,7 +161,7 @@ def test_the_report_tells_stop_events_domain_and_conventions():
     )
 
 
-@pytest.mark.parametrize("scene", [IsokineticParticle(), Skate()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("scene", [IsokineticParticle(), Skate()], ids=name_of)
 def test_the_report_for_machines_has_the_named_fields_and_is_json(scene):
     facts = json.loads(json.dumps(report(scene).as_dict(), allow_nan=False))
     assert set(facts) >= {

@@ -141,7 +141,7 @@ def test_errors_of_a_sleigh_fall_with_the_tolerance_and_steps_with_the_order():
 
 @pytest.mark.parametrize("span", [2.0, -2.0])
 def test_motions_with_projection_and_work_are_those_of_dopri8(span):
-    scene = jj.models.MODELS["double-pendulum-rods"]()
+    scene = jj.models.DoublePendulumRods()
     options = {"ts": np.linspace(0.0, span, 11), "rtol": 1e-11, "atol": 1e-11}
     ours, theirs = (
         jj.simulate(scene, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8())
@@ -164,13 +164,10 @@ def test_motions_with_projection_and_work_are_those_of_dopri8(span):
             "jj.Taylor\\(\\) cannot integrate `TiltingDisc`: another backend",
         ),
         (
-            lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)),
+            lambda: jj.simulate(jj.models.BallOnTurntable(), t1=1.0, solver=jj.Taylor(30)),
             "products, more than",
         ),
-        (
-            lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()),
-            "has no Taylor series",
-        ),
+        (lambda: jj.simulate(jj.models.SpringAndRod(), t1=1.0, solver=jj.Taylor()), "has no Taylor series"),
         (lambda: jj.simulate(Power(), {"x": 0.3}, t1=1.0, solver=jj.Taylor()), "an exponent varies"),
         (lambda: jj.Taylor(2), "`order` is 2, expected a whole number from 4 to 30"),
     ],

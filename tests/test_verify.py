@@ -5,7 +5,7 @@ fault.
 import jax
 import jax.numpy as jnp
 import pytest
-from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine, OnPlane
+from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine, OnPlane, name_of
 
 import jourdain_jax as jj
 from jourdain_jax.analysis import Verification, derivative_exists
@@ -93,9 +93,7 @@ def with_slope(f, slope):
 
 
 @pytest.mark.parametrize(
-    "scene",
-    [Sledge(), DiscWithHeightRow(), DrivenPendulum(), BeadOnTurningWire(damping=0.4)],
-    ids=lambda s: type(s).__name__,
+    "scene", [Sledge(), DiscWithHeightRow(), DrivenPendulum(), BeadOnTurningWire(damping=0.4)], ids=name_of
 )
 def test_right_scenes_pass_at_random_states(scene):
     t, q, u = (x[0] for x in jj.sample_states(scene, 1, seed=3))
