@@ -21,7 +21,7 @@ from types import MappingProxyType
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
@@ -126,9 +126,14 @@ def _made(
     ctx: mlir.LoweringRuleContext, values: Sequence, make: Callable
 ) -> tuple[mlir.LoweringRuleContext, Sequence]:
     """Apply `make` to the operands of a call. Return the context of the new call, and its operands."""
-    made = jax.make_jaxpr(make)(*ctx.avals_in)
-    lower = mlir.lower_fun(jaxpr_as_fun(made))
-    return ctx.replace(avals_in=made.out_avals), lower(ctx.replace(primitive=None), *values)
+    avals: list = []
+
+    def noted(*values):
+        avals.extend(map(jax.typeof, made := make(*values)))
+        return made
+
+    lowered = mlir.lower_fun(noted)(ctx.replace(primitive=None), *values)
+    return ctx.replace(avals_in=avals), lowered
 
 
 def on_cpu(
