@@ -7,12 +7,12 @@ import jourdain_jax as jj
 from jourdain_jax.equations import unconstrained_equations
 
 
-def admissible_states(scene: jj.Scene, count, seed=0):
+def admissible_states(scene, count, seed=0):
     """Random states (t, q, u) on the constraints."""
     return list(zip(*jj.sample_states(scene, count, seed), strict=True))
 
 
-def disagreement(scene: jj.Scene, count=20, seed=0):
+def disagreement(scene, count=20, seed=0):
     """Largest difference of accelerations and constraint forces from those by QR, relative to the largest at
     each state.
 

@@ -23,7 +23,7 @@ _FLAGS = (
 )
 
 
-def _run(url, *flags: str, budget=4000):
+def _run(url, *flags, budget=4000):
     with tempfile.TemporaryDirectory() as profile:
         hosts = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE localhost"
         command = [
@@ -46,7 +46,7 @@ def _run(url, *flags: str, budget=4000):
     return done.stdout
 
 
-def screenshot(url, path, size=(500, 350), budget=4000) -> np.ndarray:
+def screenshot(url, path, size=(500, 350), budget=4000):
     """Pixels (height, width, 3), 0 to 1, of the page at `url`; the picture is kept at `path`."""
     _run(url, f"--screenshot={path}", f"--window-size={size[0]},{size[1]}", budget=budget)
     return np.asarray(matplotlib.image.imread(path))[..., :3]

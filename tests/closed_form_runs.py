@@ -1,7 +1,5 @@
 """Runs at rtol = atol = 1e-12 against closed forms, measured at the end of the run."""
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 from tolerances import relative_error
@@ -9,7 +7,7 @@ from tolerances import relative_error
 import jourdain_jax as jj
 
 
-def end_error(scene: jj.Scene, start, motion: Callable[..., dict], run, same="", **columns: str):
+def end_error(scene, start, motion, run, same="", **columns):
     """Largest error at the end of a run, of each quantity relative to the largest value that it takes during
     the run.
 

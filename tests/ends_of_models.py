@@ -1,14 +1,12 @@
 """Numbers made of motions of models, to be differentiated."""
 
-from collections.abc import Callable
-
 import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
 
 
-def end_of_model(name, start, parameters, **options) -> tuple[Callable, jnp.ndarray]:
+def end_of_model(name, start, parameters, **options):
     """A number made of saved states and the end of a motion, as a function of parameters and two directions
     of the start; and where to look.
     """

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from generated_scenes import LENGTHS, Recipe, body_name, coordinate_list, generated
+from generated_scenes import LENGTHS, body_name, coordinate_list, generated
 from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
@@ -43,7 +43,7 @@ PUSH = 0.7  # value of the input, where a scene has one
 NEAR = 0.03
 
 
-def instances(recipe: Recipe, parameters, states, seed):
+def instances(recipe, parameters, states, seed):
     """Scenes with random parameters as one batch, the first of them alone, and states off the rows: (t, q,
     u), `states` of them for each scene.
     """
@@ -58,7 +58,7 @@ def instances(recipe: Recipe, parameters, states, seed):
     return stacked, scene, draw.uniform(0, 2, count), q, u
 
 
-def dimensions(recipe: Recipe):
+def dimensions(recipe):
     """Which coordinates, and which speeds, are lengths and their rates."""
     q, u = [], []
     for _, stem, _ in coordinate_list(recipe):
@@ -67,7 +67,7 @@ def dimensions(recipe: Recipe):
     return tuple(q), tuple(u)
 
 
-def evaluated(recipe: Recipe, *, parameters, states, seed=0, compiled=False, looks=True):
+def evaluated(recipe, *, parameters, states, seed=0, compiled=False, looks=True):
     """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen
     differently.
     """
@@ -157,7 +157,7 @@ def _accelerations(scene, ways, t, q, u, inputs):
     )
 
 
-def _seen(recipe: Recipe, scene, view, t, q, u, rate):
+def _seen(recipe, scene, view, t, q, u, rate):
     """Accelerations of the same motion, seen differently."""
     inputs = PUSH * jnp.ones(len(scene.inputs))
     lengths, paces = dimensions(recipe)
@@ -252,7 +252,7 @@ def _plain(scene, t, q, u, sign):
     }
 
 
-def admitted(found) -> np.ndarray:
+def admitted(found):
     """Which instances lie on the rows, away from a loss of rank (of the rows, or of M)."""
     rank = found["rank"]
     return (
@@ -263,7 +263,7 @@ def admitted(found) -> np.ndarray:
     )
 
 
-def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
+def residuals(recipe, found):
     """Residual of every invariant at the admitted instances, each an array over them."""
     good = admitted(found)
     found = jax.tree.map(lambda x: x[good], found)
@@ -310,7 +310,7 @@ def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
     return out | (_of_views(found) if "seen" in found else {})
 
 
-def _of_views(found) -> dict[str, np.ndarray]:
+def _of_views(found):
     """One motion, seen differently, by every reduction."""
     seen = found["seen"]
     names, _ = views(1, 1)

@@ -91,7 +91,7 @@ class PlanarRobot(jj.Scene):
         return rows
 
     def loads(self, m):
-        return (jj.generalized_force(m, left_rate=0.3 * jnp.cos(m.t), right_rate=0.1 + 0 * m.t),)
+        return jj.generalized_force(m, left_rate=0.3 * jnp.cos(m.t), right_rate=0.1 + 0 * m.t)
 
     def start(self, left=3.0, right=12.0, **more):
         """A start in which it turns: assembled, the trailers at an angle."""
@@ -132,7 +132,7 @@ class BeadOnCurve(jj.Scene):
         return {"arc": x * vy - y * vx - m.u.s_rate} | ({"curve": x * vx + y * vy} if self.by_rate else {})
 
     def loads(self, m):
-        return (jj.gravity(m, 9.81 * 1.09**0.5, np.array((0.3, -1.0, 0.0)) / 1.09**0.5),)
+        return jj.gravity(m, 9.81 * 1.09**0.5, np.array((0.3, -1.0, 0.0)) / 1.09**0.5)
 
     def start(self, speed=9.0):
         """On the curve, fast enough to go round."""

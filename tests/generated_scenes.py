@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax import Scene
 
 GROUND = -1
 MOST_SPEEDS = 6
@@ -108,7 +107,7 @@ def coordinates_of(kind):
     return KINDS[kind]
 
 
-def coordinate_list(recipe: Recipe):
+def coordinate_list(recipe):
     """Body, stem and middle of every coordinate; a quaternion counts once."""
     return [
         (i, stem, middle + (1.1 * i if stem == "x" else 0.0))
@@ -122,7 +121,7 @@ def speed_count(kind):
     return sum(3 if stem == "*" else 1 for stem, _ in KINDS[kind])
 
 
-def plain_coordinates(recipe: Recipe):
+def plain_coordinates(recipe):
     """Positions, among all speeds, of coordinates that are no quaternions."""
     found, at = [], 0
     for _, stem, _ in coordinate_list(recipe):
@@ -169,7 +168,7 @@ class Generated(jj.Scene):
             if stem != "*"
         }
 
-    def reference(self) -> np.ndarray:
+    def reference(self):
         """The configuration at which it is assembled."""
         q: list[float] = []
         for _, stem, middle in coordinate_list(self.recipe):
@@ -317,7 +316,7 @@ class Generated(jj.Scene):
             made += [] if load is None else [load]
         return tuple(made)
 
-    def _load(self, part: Part, strength, motion):
+    def _load(self, part, strength, motion):
         t, u = motion.t, motion.u.array
         if part.kind in ("drag", "input"):
             speed, w = self.speed_names.entries[part.on[0]], u[part.on[0]]
@@ -386,7 +385,7 @@ class GeneratedWithOwnSpeeds(Generated):
         return self._rates(motion.q.array, motion.u.array)
 
 
-def recipe(seed) -> Recipe:
+def recipe(seed):
     """The structure with this number: first body and first row go through all kinds in turn, the rest is
     drawn.
     """
@@ -401,7 +400,7 @@ def recipe(seed) -> Recipe:
     return replace(empty, rows=rows, loads=_drawn_loads(empty, draw))
 
 
-def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
+def _drawn_rows(made, draw):
     bodies, free = made.bodies, plain_coordinates(made)
     held = {"disc": 2, "wheel": 3, "ball on a lift": 3}
     left = sum(speed_count(kind) - held.get(kind, 2 * kind.startswith("ball")) for kind in bodies)
@@ -474,12 +473,12 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
     return tuple(rows)
 
 
-def _coordinate_index(made: Recipe, number):
+def _coordinate_index(made, number):
     """Position among the entries of q of a coordinate given by its place in the list."""
     return sum(4 if stem == "*" else 1 for _, stem, _ in coordinate_list(made)[:number])
 
 
-def _drawn_loads(made: Recipe, draw) -> tuple[Part, ...]:
+def _drawn_loads(made, draw):
     rigid = [i for i, kind in enumerate(made.bodies) if kind not in ("particle", "bead", "slider", "swing")]
     first, last = 0, len(made.bodies) - 1
     free = plain_coordinates(made)
@@ -507,7 +506,7 @@ def _drawn_loads(made: Recipe, draw) -> tuple[Part, ...]:
     return tuple(Part(kind, on) for kind in dict.fromkeys(wanted) if (on := choices[kind]) is not None)
 
 
-def generated(recipe: Recipe, seed) -> Scene:
+def generated(recipe, seed):
     """A scene of this structure with random parameters, assembled at its reference configuration."""
     draw = np.random.default_rng([recipe.seed, seed])
     n, rows = len(recipe.bodies), len(recipe.rows)

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,14 +55,14 @@ define void @run(ptr %words, ptr %number_and_count) {
 
 
 @functools.cache
-def _key() -> int:
+def _key():
     """Of what is a thread's own: its number, and how many there are."""
     key = ctypes.c_uint()
     assert ctypes.CDLL(None).pthread_key_create(ctypes.byref(key), None) == 0
     return key.value
 
 
-def twin_text(text: str) -> str:
+def twin_text(text):
     """The kernel as a module for the CPU."""
     text = re.sub(r"declare .*llvm\.nvvm.*\n", "", text.replace("ptx_kernel ", ""))
     text = re.sub(r"@llvm\.nvvm\.(read\.ptx\.sreg\.)?", "@twin.", text)
@@ -86,7 +86,7 @@ class Driver:
     order: str = "in order"
     fails: Mapping[str, int] = MappingProxyType({})
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.loaded: list[str] = []
         self.launched = Counter[str]()
         self.twins: dict[int, int] = {}
@@ -110,7 +110,7 @@ class Driver:
         self.allocate, self.free = (_C(_pointer, words)(f) for f in (self._allocate, self._free))
         self.interface = (_pointer * 1)()  # XLA's own
 
-    def _allocate(self, asked) -> int | None:
+    def _allocate(self, asked):
         size, alignment = asked[3:5]
         if "DeviceMemory_Allocate" in self.fails:
             text = ctypes.c_char_p(b"no memory for a record")
@@ -124,20 +124,20 @@ class Driver:
         asked[5] = ctypes.addressof(record)
         return None
 
-    def _free(self, asked) -> int | None:
+    def _free(self, asked):
         return None if len(self.records.pop(asked[4])) == asked[3] and asked[0] == 40 else 1
 
-    def _copy(self, to, place, count, stream) -> int:
+    def _copy(self, to, place, count, stream):
         ctypes.memmove(to, place, count)
         return self.fails.get("cuMemcpyDtoHAsync_v2", int(stream != 99))
 
-    def _memset(self, place, value, count, stream) -> int:
+    def _memset(self, place, value, count, stream):
         ctypes.memmove(place, (_int * count)(*[value] * count), 4 * count)
         return 0
 
     def _launch(
         self, function, across, y, z, threads, threads_y, threads_z, shared, stream, parameters, extra
-    ) -> int:
+    ):
         if (y, z, threads, threads_y, threads_z, shared, stream, extra) != (
             1,
             1,
@@ -163,17 +163,17 @@ class Driver:
                 call(number)
         return 0
 
-    def load(self, text: bytes, name: str) -> nvidia.Loaded:
+    def load(self, text, name):
         """A kernel, which is made when it is launched."""
         self.loaded.append(text.decode())
         return nvidia.Loaded(len(self.loaded), 1000, 255)
 
-    def _twin(self, number: int) -> int:
+    def _twin(self, number):
         if number not in self.twins:
             self.twins[number] = host.address(host.object_code(twin_text(self.loaded[number - 1]), 1), "run")
         return self.twins[number]
 
-    def _error(self, code, place) -> int:
+    def _error(self, code, place):
         place[0] = _SAID[code]
         return 0
 
@@ -218,7 +218,7 @@ declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 
 
 @contextmanager
-def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, **fails: int) -> Iterator[Counter[str]]:
+def in_place_of_a_gpu(order="in order", memory=2**40, **fails):
     """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts
     of all kernels, each with how often it ran.
     """
@@ -260,14 +260,12 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, **fails: int
             assert not DRIVER.records, "memory of XLA's that was not given back"
 
 
-def driver_of_devices(
-    capabilities: list[tuple[int, int]], fails: int = 0, missing: str = ""
-) -> SimpleNamespace:
+def driver_of_devices(capabilities, fails=0, missing=""):
     """Functions by which a driver describes its devices; `fails`: what its start returns, `missing`: a
     function that it has not.
     """
 
-    def says(what: Callable) -> Callable:
+    def says(what):
         return lambda *given: (
             setattr(next(x for x in given if hasattr(x, "_obj"))._obj, "value", what(*given)) or 0
         )
@@ -280,13 +278,13 @@ def driver_of_devices(
     return SimpleNamespace(**dict.fromkeys(set(nvidia._CALLED) - {missing}) | own)
 
 
-def assembler() -> str | None:
+def assembler():
     """NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit."""
     found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")]
     return found[0] if found else shutil.which("ptxas")
 
 
-def said_by_assembler(ptx: str) -> str:
+def said_by_assembler(ptx):
     """What it says of text for compute capability 9.0; empty where there is none."""
     if not (found := assembler()):
         return ""

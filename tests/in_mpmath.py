@@ -38,7 +38,7 @@ class Known(NamedTuple):
     error: mpmath.mpf
 
 
-def found(op, arguments, round_off) -> Known | bool | None:
+def found(op, arguments, round_off):
     """What an operation makes of numbers that are known so well, given its own round-off, relative; None
     where that is not settled.
 

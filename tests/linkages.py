@@ -31,7 +31,7 @@ class Parallelogram(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def geometric_constraints(self, pose):
         end = self._points(pose.q)[2]
@@ -89,13 +89,13 @@ class Loop(jj.Scene):
         return {"place": r, "attitude": (R - jnp.eye(3)).ravel()}
 
 
-def bennett(twist, other, length=1.0) -> Loop:
+def bennett(twist, other, length=1.0):
     """Bennett's four-bar linkage: opposite links are equal, `sin(twist)/length` is the same for all."""
     lengths = (length, float(length * np.sin(other) / np.sin(twist)))
     return Loop(lengths * 2, (twist, other) * 2)
 
 
-def bricard(*lengths: float) -> Loop:
+def bricard(*lengths):
     """Bricard's trihedral six-bar linkage from five lengths: the sums of squares of even and odd links are
     equal, twists are right angles by turns.
     """

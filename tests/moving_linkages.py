@@ -9,17 +9,17 @@ from jaxtyping import Array, Float
 import jourdain_jax as jj
 
 
-def rod_body(x, z, angle, length, mass) -> jj.RigidBody:
+def rod_body(x, z, angle, length, mass):
     """A uniform thin rod in the plane y = 0, centred at (x, z) m, at `angle` (rad) to the x axis."""
     return jj.RigidBody(mass, mass * length**2 / 12 * jnp.ones(3), jnp.stack([x, 0 * x, z]), jj.rot_y(-angle))
 
 
-def end_of(body, distance) -> Float[Array, "3"]:
+def end_of(body, distance):
     """The point of a rod at `distance` (m) from its centre."""
     return body.place(jnp.stack([distance, 0 * distance, 0 * distance]))
 
 
-def pinned(name, first: Float[Array, "3"], second: Float[Array, "3"]):
+def pinned(name, first, second):
     """Two rows that hold two points of the plane together."""
     return {f"{name} x": first[0] - second[0], f"{name} z": first[2] - second[2]}
 
@@ -77,7 +77,7 @@ class SliderCrank(jj.Scene):
         return pinned("pin", end_of(pose["rod"], jnp.asarray(0.5)), pose["slider"].position)
 
 
-def slider_crank_motion(a_0, rate, ts, slider=0.5) -> np.ndarray:
+def slider_crank_motion(a_0, rate, ts, slider=0.5):
     """Angle a (rad) of `SliderCrank` at times `ts` on its branch b = -a, by quadrature of the energy.
 
     T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the
@@ -122,7 +122,7 @@ class NarrowPendulum(jj.Scene):
         return {"bob": jj.Particle(1.0, [q.x, 0.0, q.z])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def geometric_constraints(self, pose):
         return {"rod": jj.rod(jnp.zeros(3), pose["bob"].position, self.length)}

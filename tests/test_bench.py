@@ -235,7 +235,7 @@ from baselines import count, dense, disc_run, flat, heyoka_disc, heyoka_lowered 
 STATES = 20
 
 
-def _with_random_parameters(name) -> jj.Scene:
+def _with_random_parameters(name):
     """A model whose parameters differ from the defaults by up to 20 %, angles that are zero excepted: they
     become 0.2.
     """
@@ -271,7 +271,7 @@ def _columns(states):
     return tuple(np.asarray(states).T)
 
 
-def _parameters(scene: jj.Scene):
+def _parameters(scene):
     return {
         field.name: float(getattr(scene, field.name))
         for field in dataclasses.fields(scene)

@@ -121,7 +121,7 @@ def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
 
 
-def crane() -> type[jj.Scene]:
+def crane():
     """A new class of a scene whose parameters decide which speed is best kept independent."""
 
     class Crane(InSpace):

@@ -205,11 +205,7 @@ def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
 
     def lanes(k):
         found = jj.rollout(
-            Pushed(),
-            {"x": np.array([0.1, 0.2])},
-            ts=TS,
-            inputs={"f": lambda t: k * jnp.sin(t)},
-            progress=False,
+            Pushed(), {"x": np.array([0.1, 0.2])}, ts=TS, inputs={"f": lambda t: k * jnp.sin(t)}
         )
         return jnp.sum(found["x"][:, -1]) / 2
 

@@ -44,7 +44,7 @@ def poses(scene, count):
     return np.hstack([place, random.normal(size=(count, 4))])
 
 
-def rolling(ground, shape) -> Rolls:
+def rolling(ground, shape):
     scene = Rolls(make_ground=GROUNDS[ground], shape=shape, moments=(0.3, 0.4, 0.35))
     object.__setattr__(scene, "shape_of_ground", ground)
     return scene

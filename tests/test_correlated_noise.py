@@ -19,13 +19,13 @@ START = {"x_rate": -0.6, "heading_rate": 0.9}
 TRUTH = {"inertia": 0.4, "offset": 0.25}
 
 
-def coloured(generator, ts, tau, shape=()) -> np.ndarray:
+def coloured(generator, ts, tau, shape=()):
     """Draws of a process of variance one with covariance exp(-|t - t'| / tau), by a Cholesky factor."""
     factor = np.linalg.cholesky(np.exp(-np.abs(ts[:, None] - ts) / tau))
     return generator.normal(size=(*shape, len(ts))) @ factor.T
 
 
-def sleigh_run(seed, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Experiment:
+def sleigh_run(seed, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()):
     motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
     generator = np.random.default_rng(seed)
     values = {

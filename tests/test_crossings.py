@@ -196,8 +196,8 @@ def test_guards_and_smooth_functions_do_not_count():
 
 
 def test_what_is_not_watched_is_said():
-    many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
-    assert jax.eval_shape(lambda: motion(many)).unwatched == "there are 40, more than 32"
+    many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(33)))
+    assert jax.eval_shape(lambda: motion(many)).unwatched == "there are 33, more than 32"
     hidden = motion(Sliding(law=lambda s, t, x, v: jnp.interp(x, jnp.array([0.6, 0.7, 0.8]), jnp.eye(3)[1])))
     assert "not monitored: parts of the scene are JAX calls" in str(hidden)
     with pytest.warns(

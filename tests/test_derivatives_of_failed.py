@@ -25,7 +25,7 @@ class Slider(OnLine):
 
     def loads(self, motion):
         force = -self.stiffness * motion.q.x + jnp.sqrt(motion.q.x - self.edge)
-        return (jj.generalized_force(motion, x_rate=force),)
+        return jj.generalized_force(motion, x_rate=force)
 
 
 # what the second lane has in place of (amplitude 1, stiffness p, mass 1, edge -50), and whether it takes

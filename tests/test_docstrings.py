@@ -65,7 +65,7 @@ position_residual structure_of
 """
 
 
-def _methods(owner: type):
+def _methods(owner):
     """Public methods and properties that a class of the package defines, by name."""
     for name in dir(owner):
         value = inspect.getattr_static(owner, name)

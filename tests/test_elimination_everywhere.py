@@ -90,7 +90,7 @@ class LightKnee(jj.Scene):
         return {"rod": q.x**2 + q.z**2 - 1.0, "straight": jnp.stack([q.x_end - 2 * q.x, q.z_end - 2 * q.z])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81, (0.0, 0.0, -1.0)),)
+        return jj.gravity(motion, 9.81, (0.0, 0.0, -1.0))
 
 
 class Twice(PlanarRobot):

@@ -30,7 +30,7 @@ DRAWS, STATES = 5, 20
 natively = machine_code.needed
 
 
-def other_parameters(name, seed) -> jj.Scene:
+def other_parameters(name, seed):
     """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1, unless they
     must not be negative.
     """

@@ -123,7 +123,7 @@ def test_coordinates_of_which_the_rows_leave_no_choice_may_leave_the_domain():
 
 def test_lanes_are_put_together_in_the_domain_or_end_with_a_code():
     scene, places = Hanging(), np.array([0.1, 0.6, 1.0])
-    lanes = jj.rollout(scene, {"x": places, "y": 0.0}, ts=[0.1], progress=False)
+    lanes = jj.rollout(scene, {"x": places, "y": 0.0}, ts=[0.1])
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.INCONSISTENT_START]
     height = lambda x: jj.start(scene, x=x, y=0.0).q[2]
     values, slopes = eval_numpy(jax.vmap(jax.value_and_grad(height)))(places[:2])
@@ -152,7 +152,7 @@ def test_an_attitude_of_which_a_part_is_named_is_refused_where_many_have_it(give
             given,
         )
     if len(given) == 1:
-        lanes = jj.rollout(disc, {"attitude_w": np.array([0.0, 0.3])}, ts=[0.1], progress=False)
+        lanes = jj.rollout(disc, {"attitude_w": np.array([0.0, 0.3])}, ts=[0.1])
         assert set(np.asarray(lanes.result)) <= {results.INCONSISTENT_START, results.BAD_START}
 
 
@@ -279,7 +279,7 @@ def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_fo
 STEP = 2e-3
 
 
-def _slope(function, s=0.0) -> np.ndarray:
+def _slope(function, s=0.0):
     """The derivative by Richardson's extrapolation of central differences, of order 6."""
     D = [
         (np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h)
@@ -289,7 +289,7 @@ def _slope(function, s=0.0) -> np.ndarray:
     return (16 * D[1] - D[0]) / 15
 
 
-def _along(scene: jj.Scene, held, off):
+def _along(scene, held, off):
     """What is put onto the rows as a function of one number, on which parameters, time, coordinates and
     speeds depend.
     """

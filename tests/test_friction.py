@@ -22,7 +22,7 @@ class Heavy(jj.Scene):
     """What weighs and has no other load."""
 
     def loads(self, motion):
-        return (jj.gravity(motion, getattr(self, "g", G)),)
+        return jj.gravity(motion, getattr(self, "g", G))
 
 
 class Ball(Heavy):
@@ -194,7 +194,7 @@ class Tilted(Ball):
 
     def loads(self, motion):
         weight = self.mass * self.g * jnp.stack([jnp.sin(self.slope), jnp.zeros(()), -jnp.cos(self.slope)])
-        return (jj.Load(forces={"ball": weight}),)
+        return jj.Load(forces={"ball": weight})
 
 
 def by_hand(bounce, friction, t1):

@@ -29,7 +29,7 @@ def _gallery_can_be_imported():
         sys.path.remove(str(path))
 
 
-def scene_of(name, **parameters) -> jj.Scene:
+def scene_of(name, **parameters):
     """The scene in the file of this name."""
     module = importlib.import_module(f"scenes.{name}")
     kinds = [
@@ -197,7 +197,7 @@ def test_every_page_draws_the_picture_that_it_shows(tmp_path):
         assert (tmp_path / re.search(r"Source: \[.*\]\((.*)\)", text)[1]).resolve() == entry.source
 
 
-def written(tmp_path, *names: str):
+def written(tmp_path, *names):
     """Pages and index of these names are there, with pictures that show something."""
     maker().main(["--out", str(tmp_path), *names])
     index = (tmp_path / "index.md").read_text()

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from generated_invariants import admitted, evaluated, instances, residuals
-from generated_scenes import KINDS, Recipe, recipe
+from generated_scenes import KINDS, recipe
 from tolerances import ROUND_OFF, tolerance
 
 from jourdain_jax import Lowered
@@ -27,7 +27,7 @@ MANY_PARAMETERS, MANY_STATES, MANY = 12, 20, 200  # 5,000 in all
 QUICKLY_LOWERED = (13, 16, 22)
 
 
-def broken(made: Recipe, found):
+def broken(made, found):
     """The invariants that do not hold to round-off, with their largest residuals."""
     largest = {name: float(np.max(values, initial=0.0)) for name, values in residuals(made, found).items()}
     return {name: value for name, value in largest.items() if not value <= ROUND_OFF}

@@ -33,7 +33,7 @@ ARCHITECTURES = ("sm_75", "sm_80", "sm_90", "sm_100")
 KINDS = {"values": lambda f: f, "tangents": jax.jacfwd, "gradients": jax.grad, "second": jax.hessian}
 
 
-def _numbers(name: str, kinds, **options) -> dict[str, np.ndarray]:
+def _numbers(name, kinds, **options):
     """Numbers made of five motions of a model, and their derivatives with respect to a parameter and two
     directions of the start.
     """
@@ -49,7 +49,7 @@ FEW = (
 )
 
 
-def _check(name: str, kinds, orders, **options) -> set[str]:
+def _check(name, kinds, orders, **options):
     expected, texts = _numbers(name, kinds, **options), set[str]()
     for order, memory in orders:
         with gpu_twin.in_place_of_a_gpu(order, memory) as made:
@@ -59,7 +59,7 @@ def _check(name: str, kinds, orders, **options) -> set[str]:
     return texts
 
 
-def _check_text(texts, architectures) -> None:
+def _check_text(texts, architectures):
     for text in texts:
         for architecture in architectures:
             ptx = nvidia.text_for(text, architecture)
@@ -99,7 +99,7 @@ def test_series_too(name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_events_after_which_a_motion_goes_on(kind):
-    def made() -> np.ndarray:
+    def made():
         of = KINDS[kind](lambda numbers: jnp.sum(jnp.nan_to_num(seen(numbers))))
         return np.asarray(jax.jit(jax.vmap(of))(NUMBERS * jnp.linspace(0.9, 1.1, 5)[:, None]))
 
@@ -262,7 +262,7 @@ def test_the_record_has_a_slot_for_each_step_and_keeps_to_the_memory_of_the_mode
             assert 0.9 * memory < slot * most <= memory
 
 
-def _reason(monkeypatch, uses=(0,), **library) -> str:
+def _reason(monkeypatch, uses=(0,), **library):
     devices = [SimpleNamespace(local_hardware_id=number) for number in uses]
     monkeypatch.setattr(jax, "local_devices", lambda backend: devices)
     monkeypatch.setattr(nvidia, "driver", lambda: gpu_twin.driver_of_devices(**library))

@@ -239,7 +239,7 @@ def test_two_joints_stop_and_start_as_by_an_independent_integration():
 def test_what_cannot_hold_is_refused():
     class Unknown(Oscillator):
         def loads(self, motion):
-            return (jj.joint_friction(motion, y_rate=1.0),)
+            return jj.joint_friction(motion, y_rate=1.0)
 
     refused("friction on unknown speed `y_rate`", Unknown)
     refused(

@@ -26,7 +26,7 @@ class Weightless(OnLine):
     coordinates = jj.coordinates("x y")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=3.0, y_rate=1.0),)
+        return jj.generalized_force(motion, x_rate=3.0, y_rate=1.0)
 
 
 class Geared(Weightless):
@@ -170,14 +170,14 @@ class Parted(jj.Scene):
         return {"body": body, "left": jj.Particle(self.whole - self.part, [q.x, q.y, 0.0])}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=1.0),)
+        return jj.generalized_force(motion, x_rate=1.0)
 
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
 def test_lanes_in_which_a_free_motion_has_no_inertia_are_wrong_parameters(backend):
     # no force acts along y, or turns the body: the lost inertia had left the equations
     numbers = {"part": np.array([0.5, 1.5, 0.5, 0.5]), "moments": np.array([1.0, 1.0, 0.0, np.nan])}
-    lanes = jj.rollout(Parted(), {"y_rate": 0.1}, parameters=numbers, t1=1.0, backend=backend, progress=False)
+    lanes = jj.rollout(Parted(), {"y_rate": 0.1}, parameters=numbers, t1=1.0, backend=backend)
     assert lanes.result.tolist() == [results.SUCCESS] + 3 * [results.BAD_PARAMETER]
 
 
@@ -215,7 +215,7 @@ class BurningRocket(jj.Scene):
         return {"rocket": jj.RigidBody(left, left * jnp.ones(3), [q.x, 0.0, 0.0], jj.rot_z(q.angle))}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=3.0),)
+        return jj.generalized_force(motion, x_rate=3.0)
 
 
 def test_mass_that_leaves_takes_its_momentum_with_it():
@@ -319,7 +319,7 @@ class Rolling(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81, direction=self.down),)
+        return jj.gravity(motion, 9.81, direction=self.down)
 
 
 class Turned(jj.Scene):
@@ -440,7 +440,7 @@ def test_an_impossible_body_without_parameters_is_a_code_where_others_are_traced
             }
 
         def loads(self, motion):
-            return (jj.generalized_force(motion, yaw_rate=-self.stiffness * motion.q.yaw),)
+            return jj.generalized_force(motion, yaw_rate=-self.stiffness * motion.q.yaw)
 
     assert int(compiled(Sprung(), "auto")[0]) == results.BAD_PARAMETER
 

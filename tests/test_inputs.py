@@ -31,7 +31,7 @@ class OnBelt(OnPlane):
     domain = {"y": (-0.4, 0.4)}
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, y_rate=motion.inputs.push),)
+        return jj.generalized_force(motion, y_rate=motion.inputs.push)
 
     def velocity_constraints(self, motion):
         return {"belt": motion.u.x_rate - (1.0 + motion.q.y) * motion.inputs.speed}
@@ -299,7 +299,7 @@ class Struck(OnLine):
     inputs = jj.inputs("force push")
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.force + motion.inputs.push),)
+        return jj.generalized_force(motion, x_rate=motion.inputs.force + motion.inputs.push)
 
 
 BLOW = jj.Sampled([0.0, 2.0137, 2.0142, 2.0147, 10.0], [0.0, 0.0, 2000.0, 0.0, 0.0])  # 1 N s about 2.0142 s

@@ -33,7 +33,7 @@ class PendulumInAngle(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
+        return jj.gravity(motion, GRAVITY)
 
 
 class BodyPendulum(PendulumInAngle):
@@ -152,7 +152,7 @@ class Driven(jj.Scene):
         return {"end": jj.Particle(0.5, [q.end, o, o]), "mass": jj.Particle(self.mass, [1.0 + q.place, o, o])}
 
     def loads(self, motion):
-        return (jj.spring(motion["end"].point(), motion["mass"].point(), self.stiffness, 1.0),)
+        return jj.spring(motion["end"].point(), motion["mass"].point(), self.stiffness, 1.0)
 
     def prescribed(self, t):
         return {"end": self.amplitude * jnp.sin(self.rate * t)}

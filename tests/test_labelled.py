@@ -24,7 +24,7 @@ def motion():
 def lanes():
     starts = {"x_rate": np.linspace(0.5, 2.0, 3), "heading_rate": 0.7}
     masses = {"mass": np.array([1.0, 2.0, 3.0])}
-    return jj.rollout(jj.models.Skate(), starts, parameters=masses, ts=TIMES, progress=False)
+    return jj.rollout(jj.models.Skate(), starts, parameters=masses, ts=TIMES)
 
 
 def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):

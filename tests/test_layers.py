@@ -7,7 +7,6 @@ A layer imports itself and what lies below it; only the package's `__init__` see
 
 import ast
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,7 +70,7 @@ def _statements(node, inside=False):
             yield from _statements(inner, inside)
 
 
-def _imports(module, path, known) -> Iterator[Import]:
+def _imports(module, path, known):
     above = [*module.split("."), *(["__init__"] if path.name == "__init__.py" else [])]
     for node, inside in _statements(ast.parse(path.read_text())):
         if isinstance(node, ast.Import | ast.ImportFrom):
@@ -88,7 +87,7 @@ def _imports(module, path, known) -> Iterator[Import]:
                 yield Import(target, node.lineno, inside, name == "*")
 
 
-def _rank(module, package) -> int | None:
+def _rank(module, package):
     """Place of a module's layer in the table, the first name below the package; None where it has none."""
     layer = module.removeprefix(package).lstrip(".").split(".")[0] or "__init__"
     return len(LAYERS) if layer in ENTRY_MODULES else LAYERS.index(layer) if layer in LAYERS else None

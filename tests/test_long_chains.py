@@ -19,7 +19,7 @@ from jourdain_jax.program.identity_test import identity_probes
 from jourdain_jax.structure.assembly import assemble
 
 
-def links(count) -> tuple[Pattern, np.ndarray]:
+def links(count):
     """Rods in a row whose ends are points of a plane, and points on a zigzag: their rows in an order of no
     use.
     """
@@ -29,7 +29,7 @@ def links(count) -> tuple[Pattern, np.ndarray]:
     return Pattern.of(entries, (count, 2 * count + 2)), points
 
 
-def looking(pattern: Pattern, squares: np.ndarray):
+def looking(pattern, squares):
     """Of the squared lengths of those rods."""
 
     def look(q, which):

@@ -30,7 +30,7 @@ class Ball(jj.Scene):
         return {"ball": jj.Particle(1.0, [0.0, 0.0, q.z])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, self.gravity),)
+        return jj.gravity(motion, self.gravity)
 
     def events(self, motion):
         return {"floor": jj.Event(motion.q.z, jump={"z_rate": -self.bounce * motion.u.z_rate})}
@@ -61,7 +61,7 @@ class Switching(jj.Scene):
             1 + spring
         )
         along_x = along_x + motion.inputs.push + 0.3 * jnp.cos(2 * motion.t)
-        return (jj.Load(forces={"block": jnp.stack([along_x, 0.5 * side * q.x - 2.0 * q.y, 0.0 * q.x])}),)
+        return jj.Load(forces={"block": jnp.stack([along_x, 0.5 * side * q.x - 2.0 * q.y, 0.0 * q.x])})
 
     def events(self, motion):
         q, u, t, spring = motion.q, motion.u, motion.t, motion.modes.spring
@@ -218,7 +218,7 @@ class Rimless(jj.Scene):
         return {"hub": jj.Particle(1.0, [jnp.sin(q.angle), 0.0, jnp.cos(q.angle)])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return jj.gravity(motion, 9.81)
 
     def events(self, motion):
         half = jnp.pi / 8
@@ -310,7 +310,7 @@ class Again(jj.Scene):
         return {"mass": jj.Particle(1.0, [q.y, 0.0, q.z])}
 
     def loads(self, motion):
-        return (jj.gravity(motion, 1.0),)
+        return jj.gravity(motion, 1.0)
 
     def events(self, motion):
         return {
@@ -335,7 +335,7 @@ class Timed(OnLine):
     modes = jj.modes(push=("soft", "hard"))
 
     def loads(self, motion):
-        return (jj.gravity(motion, 1.0 + motion.modes.push, jnp.array([1.0, 0.0, 0.0])),)
+        return jj.gravity(motion, 1.0 + motion.modes.push, jnp.array([1.0, 0.0, 0.0]))
 
     def events(self, motion):
         late = self.way * (self.at - motion.t)

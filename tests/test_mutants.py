@@ -36,7 +36,6 @@ from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.explicit_steps import method_of
 from jourdain_jax.integrate.loop import native_motion, step
 from jourdain_jax.integrate.loop.loop_function import Start
-from jourdain_jax.integrate.setup import Solved
 from jourdain_jax.integrate.vector_fields.field import Integrated
 from jourdain_jax.lowering import appell, lower, multipliers, partial_velocities
 from jourdain_jax.models import MODELS
@@ -45,7 +44,7 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.structure.trace import named_values
 
 
-def rewritten(function: Callable, right: str, wrong: str) -> Callable:
+def rewritten(function, right, wrong):
     """The function with one piece of its text, which must occur once, replaced, without its decorators."""
     text = textwrap.dedent(inspect.getsource(inspect.unwrap(function)))
     assert text.count(right) == 1, (
@@ -65,7 +64,7 @@ def rewritten(function: Callable, right: str, wrong: str) -> Callable:
 # The scalar program
 
 
-def program_of(name: str) -> tuple[jj.Scene, Lowered]:
+def program_of(name):
     """A scene with its program, which must have been built and found to agree with dense matrices."""
     scene = MODELS[name]()
     found = lower.lowered(scene)
@@ -73,7 +72,7 @@ def program_of(name: str) -> tuple[jj.Scene, Lowered]:
     return scene, found
 
 
-def values(scene: jj.Scene, program: Lowered, t, q, u) -> Probes:
+def values(scene, program, t, q, u):
     """The program's nodes at some states."""
     return Probes(program.graph, named_values(scene, t, q, u, np.zeros((len(t), len(scene.inputs)))))
 
@@ -146,9 +145,7 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(
-    rates: Callable, *, rtol: float, project=None, events=None, knots=None, dt0: float = 1.0, longest=np.inf
-) -> Callable:
+def loop(rates, *, rtol, project=None, events=None, knots=None, dt0=1.0, longest=np.inf):
     """`(y0, goals, k)` -> (loop on arrays, its start); functions are of (t, y, k), the state is one of
     coordinates.
     """
@@ -175,7 +172,7 @@ def loop(
     return run
 
 
-def motion(run: Callable) -> Callable:
+def motion(run):
     """What a loop finds, by its arguments; states at all goals but the last."""
 
     @jax.jit
@@ -267,18 +264,18 @@ GOALS = {"saved times": 0.2 * np.arange(25.0), "an event": np.array([0.0, 0.5, 1
 START = {"y0": np.array([0.8, 0.6, 0.4]), "k": np.array(1.1)}
 
 
-def given(case: str, start: dict = START) -> tuple:
+def given(case, start=START):
     """What a loop is given."""
     return start["y0"], jnp.asarray(GOALS[case]), start["k"]
 
 
-def weighed(end: Solved):
+def weighed(end):
     """One number of all that a motion gives."""
     states = jnp.concatenate([jnp.ravel(end.ys.q), end.y_end.q])
     return jnp.sum(jnp.cos(1.0 + jnp.arange(float(states.size))) * states) + 0.7 * end.t_end
 
 
-def backwards_through(of: Loop, start: Start) -> tuple:
+def backwards_through(of, start):
     """Its derivatives by the start and by k, in reverse mode."""
     found = jax.jit(motions.flow(of, 0))(start)
     g = jax.grad(lambda found: weighed(native_motion.solved(of.form, start.goals, found)))(found)
@@ -287,7 +284,7 @@ def backwards_through(of: Loop, start: Start) -> tuple:
 
 
 @lru_cache
-def differences(case: str) -> dict:
+def differences(case):
     """Its derivatives by central differences of fourth order."""
     flat, unravel = jax.flatten_util.ravel_pytree(START)
     run, h = motion(loop(driven, **CASES[case])), 1e-3
@@ -302,7 +299,7 @@ def differences(case: str) -> dict:
     return unravel((found[0] - 8 * found[1] + 8 * found[2] - found[3]) / (12 * h))
 
 
-def forward_mode_agrees_with_differences(case: str) -> None:
+def forward_mode_agrees_with_differences(case):
     expected, found = differences(case), motion(loop(driven, **CASES[case]))
     along = jax.jvp(lambda x: weighed(found(*given(case, x))), (START,), (START,))[1]
     assert_allclose(
@@ -313,7 +310,7 @@ def forward_mode_agrees_with_differences(case: str) -> None:
     )
 
 
-def reverse_mode_agrees_with_differences(case: str) -> None:
+def reverse_mode_agrees_with_differences(case):
     expected, run, arguments = differences(case), loop(driven, **CASES[case]), given(case)
     for name, by in zip(START, backwards_through(*run(*arguments)), strict=True):
         assert_allclose(by, expected[name], atol=1e-7, err_msg=f"derivative by {name}")
@@ -358,7 +355,7 @@ class Mutant:
     check: Callable[[], None]
     shown_by: str
 
-    def bring(self, monkeypatch) -> None:
+    def bring(self, monkeypatch):
         """Put it in the place of the right code."""
         monkeypatch.setattr(
             self.owner, self.name, rewritten(getattr(self.owner, self.name), self.right, self.wrong)
