@@ -194,7 +194,7 @@ BODIES: dict[str, Case] = {
     "jj.structure_of(shaped(1.0, jnp.ones(3), nan * eye))": (
         "body `bead` of `Described` has no finite orientation at any probed state"
     ),
-    "jj.structure_of(shaped(1.0, [1.0, 1.0, 5.0]))": (
+    "jj.build(shaped(1.0, [1.0, 1.0, 5.0]))": (
         "body `bead` of `Described` has principal moments of inertia 1, 1 and 5 kg m^2, the last above the "
         "sum of the others: no distribution of mass has them"
     ),

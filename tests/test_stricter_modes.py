@@ -196,7 +196,7 @@ def test_the_traceback_of_a_mistake_in_a_method_shows_the_lines_of_its_author(sc
         call(scene)
     shown = lines(caught.value)
     assert shown[-1].endswith("# the mistake")
-    assert shown[-2].startswith("return (jj.point_force")
+    assert shown[-2].startswith("return jj.point_force")
     assert len(shown) <= 3  # with a lambda above
     assert any("JAX_TRACEBACK_FILTERING=off shows them" in note for note in caught.value.__notes__)
 

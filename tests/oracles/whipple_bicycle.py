@@ -119,7 +119,7 @@ AT_5 = {
 }
 
 
-def state_matrix(v: float, k0=K0) -> np.ndarray:
+def state_matrix(v: float, m=M, c1=C1, k0=K0, k2=K2, gravity: float = 9.81) -> np.ndarray:
     """A of d/dt (roll, steer, roll rate, steer rate)."""
-    lower = np.linalg.solve(M, -np.hstack([9.81 * k0 + v**2 * K2, v * C1]))
+    lower = np.linalg.solve(m, -np.hstack([gravity * k0 + v**2 * k2, v * c1]))
     return np.vstack([np.hstack([np.zeros((2, 2)), np.eye(2)]), lower])
