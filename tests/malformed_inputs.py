@@ -161,6 +161,9 @@ BODIES: dict[str, Case] = {
     "jj.RigidBody.thin_disc(1.0, jnp.ones(2), axis='y', position=o, orientation=eye)": (
         "radius of a disc has shape (2,), expected one"
     ),
+    "jj.RigidBody.thin_disc(1.0, 0.5, axis=eye[1], position=o, orientation=eye)": (
+        "body axis `[0. 1. 0.]` is unknown; expected one of `x`, `y`, `z`"
+    ),
     "jj.RigidBody.thin_disc(1.0, 0.5, axis=1, position=o, orientation=eye)": (
         "body axis `1` is unknown; expected one of `x`, `y`, `z`"
     ),

@@ -176,7 +176,7 @@ def _stack(values) -> Array:
 
 
 def _axis_index(axis: str) -> int:
-    if axis not in _AXES:
+    if str(axis) not in _AXES:
         raise ValueError(f"body axis `{axis}` is unknown; expected one of `x`, `y`, `z`")
     return _AXES[axis]
 
