@@ -92,7 +92,7 @@ def test_an_inertia_that_is_a_matrix_is_lowered_and_its_symmetric_part_counts():
         ).u_end
 
     I, along = np.asarray(scene.inertia), np.array([[0.3, 0.7, 0.0], [0.7, 0.0, -0.4], [0.0, -0.4, 0.2]])
-    for s in (0.0, 1.0):
+    for s in (0.0, 0.5):
         found = jj.accelerations(Tumbling(I + s * along), 0.0, [1.0, 0.0, 0.0, 0.0], omega).udot
         assert_allclose(
             (I + s * along) @ found, np.cross((I + s * along) @ omega, omega), rtol=1e-12, atol=1e-12

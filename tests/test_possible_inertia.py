@@ -103,7 +103,8 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     data = jj.Experiment(ts, values, 0.1, start=start)
     free, body = (jj.fit(scene, data, ("moments",)) for scene in (Turning(), TurningBody()))
     by_name = jj.fit(Turning(), data, {"body": possible_inertia()})
-    assert free.impossible
+    least, middle, largest = np.sort(free.scene.moments)
+    assert largest > least + middle
     assert not by_name.impossible
     assert_allclose(by_name.scene.moments, jnp.diag(body.scene.inertia()), rtol=1e-6)
     assert_allclose(by_name.tied["moments"].value, by_name.scene.moments)
