@@ -109,25 +109,11 @@ class Cart(jj.Scene):
             motion["chassis"].point((0.1, 0.2, 0.1)), self.push
         )
 
-    height = "coordinates"
-
     def contacts(self, pose):
         return {
-            f"ball{i}": jj.ball_contact(pose[f"ball{i}"], self.radius, height=self.height)
+            f"ball{i}": jj.ball_contact(pose[f"ball{i}"], self.radius, height="coordinates")
             for i in range(self.balls)
         }
-
-
-class CartOnRows(Cart):
-    """The cart with a free chassis, its balls kept on the plane by rows."""
-
-    coordinates = jj.coordinates(
-        "x y z", jj.quaternion("frame"), *(jj.quaternion(f"ball{i}") for i in range(3))
-    )
-    height = "row"
-
-    def chassis(self, q):
-        return jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.frame)
 
 
 class BallInBowl(jj.Scene):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import result_codes as results
 from numpy.testing import assert_allclose, assert_array_equal
-from test_stiff import Following
 
 import jourdain_jax as jj
 from jourdain_jax.integrate.loop import loop_function as kernels
@@ -18,29 +17,6 @@ from jourdain_jax.kernels import ffi, host
 from jourdain_jax.motion.simulate import set_up
 
 pytestmark = machine_code.needed
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("tilting-disc", {"t1": 3.0, "rtol": 1e-5, "atol": 1e-5}),
-        ("chaplygin-sleigh", {"ts": [7.0]}),
-        ("whipple-bicycle", {"ts": [1.0, 2.0]}),
-        ("tilting-disc-quaternion", {"t1": 2.0, "formulation": jj.Formulation("full")}),
-        ("ball-on-turntable", {"ts": [2.0]}),
-        ("double-pendulum-rods", {"ts": [0.0, 3.0], "t1": 3.5, "solver": diffrax.Dopri5()}),
-        ("snakeboard", {"ts": [-2.0], "t1": -3.0}),
-    ],
-)
-def test_motions_are_those_of_xla_step_by_step(name, options):
-    ours, theirs = (jj.simulate(jj.models.MODELS[name](), backend=by, **options) for by in ("native", "xla"))
-    for name in ("accepted", "rejected", "result"):
-        assert getattr(ours, name) == getattr(theirs, name)
-    names = ["q", "u", "q_end", "u_end", "t_end", *(["work"] if ours.work is not None else [])]
-    for name in names:
-        assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-10)
-    assert_allclose(ours.energies().balance, theirs.energies().balance, rtol=1e-10, atol=1e-10)
-    assert_allclose(ours.smallest_pivot, theirs.smallest_pivot, rtol=1e-9)
 
 
 DISC = jj.models.TiltingDisc()
@@ -156,12 +132,3 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
     expected = jj.simulate(jj.models.ChaplyginSleigh(), ts=[1.3, 1.4]).q[0]
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
-
-
-def test_a_stiff_motion_stays_with_the_backend_that_was_asked_for():
-    native, default = (
-        jj.simulate(Following(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend, retry=True)
-        for backend in ("native", "auto")
-    )
-    assert (native.result, native.fallback) == (results.MAX_STEPS, results.AS_ASKED)
-    assert (default.result, default.fallback) == (results.SUCCESS, results.IMPLICIT)

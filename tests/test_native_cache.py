@@ -1,7 +1,6 @@
 """Machine code that is kept on disk, and what is said while it is made."""
 
 import io
-import multiprocessing
 import os
 import re
 import stat
@@ -229,16 +228,6 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
             patch.setattr(host.llvm, what, value)
             names.append(name())
     assert len(set(names)) == 6
-
-
-def _write(name):
-    return host.kept(name, "llvm 20", lambda: b"y" * 1_000_000)
-
-
-def test_many_processes_may_write_the_same_code(folder):
-    with multiprocessing.get_context("spawn").Pool(4) as pool:
-        assert set(pool.map(_write, ["same"] * 12)) == {b"y" * 1_000_000}
-    assert [f.name for f in folder.iterdir()] == ["same.o"]
 
 
 class AtOnce:

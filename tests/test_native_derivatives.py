@@ -10,7 +10,6 @@ import machine_code
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import Cart
 from test_native_second import X, _seen
 
 import jourdain_jax as jj
@@ -29,28 +28,6 @@ def test_cotangents_of_lanes_do_not_depend_on_their_company():
     for count in (3, 9):  # fewer than a register holds, and one more than the widest
         order = np.random.default_rng(count).permutation(11)[:count]
         assert_allclose(every(lanes[order]), expected[order], rtol=1e-13, atol=1e-14)
-
-
-@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
-def test_derivatives_pass_through_motions_one_after_the_other(derivative):
-    """One compiled step, called with numbers of which other ones vary each time."""
-    options = {"inputs": {"push": 0.3}, "rtol": 1e-11, "atol": 1e-11}
-    step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, **options).end)
-
-    def late(stiffness):
-        scene = Cart(mass=1.5, damping=0.0, stiffness=stiffness)
-        state = jj.start(scene, x=1.1, x_rate=0.7)
-        for until in (0.5, 0.9, 3.0):
-            state = step(scene, state, jnp.asarray(until))
-        return jnp.concatenate([state.q, state.u])
-
-    def exact(k):
-        """x = c + a cos(w t) + b sin(w t) about c = push/stiffness, and its rate."""
-        w, c = jnp.sqrt(k / 1.5), 0.3 / k
-        a, b, wave = 1.1 - c, 0.7 / w, jnp.stack([jnp.cos(3 * w), jnp.sin(3 * w)])
-        return jnp.stack([c + jnp.stack([a, b]) @ wave, w * jnp.stack([b, -a]) @ wave])
-
-    assert_allclose(derivative(late)(6.0), jax.jacfwd(exact)(6.0), rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(6))

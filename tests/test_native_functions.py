@@ -63,17 +63,6 @@ def test_motions_and_derivatives_are_those_of_the_closed_form(derivative):
         assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
 
 
-def test_lanes_have_functions_of_their_own():
-    a = jnp.linspace(-1.0, 1.0, 11)
-    found = jax.jit(jax.vmap(lambda a: motion(**X | {"a": a})["x"]))(a)
-    assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
-    x, force = jnp.linspace(0.1, 0.5, 5), {"force": lambda t: 0.8 * jnp.sin(1.3 * t)}
-    lanes = jj.rollout(Pushed(), {"x": x}, ts=TS, inputs=force, **TIGHT).lanes
-    assert lanes.reduction.endswith("machine code")
-    expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(x)
-    assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
-
-
 @both_modes
 def test_functions_samples_and_numbers_stand_side_by_side(derivative):
     record = jj.Sampled([0.0, 1.0, 3.0], [0.0, 0.6, 0.2])

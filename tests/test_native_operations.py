@@ -45,7 +45,6 @@ SPECIAL = [
     1e6,
     1e22,
 ]
-EXACT = {"neg", "sqrt", "abs", "sign", "floor", "ceil", "round", "is_finite", *TWO} - {"atan2", "pow"}
 
 
 def _all_operations():
@@ -68,24 +67,6 @@ def of_both(points):
         emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True))),
         strict=True,
     )
-
-
-def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
-    random = np.random.default_rng(0)
-    points = np.concatenate(
-        [
-            list(product(SPECIAL, SPECIAL)),
-            random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)),
-            random.uniform(-3, 3, size=(1002, 2)),
-        ]
-    )
-    for op, ours, theirs in of_both(points):
-        theirs = np.asarray(theirs, float)
-        if op in ("sin", "cos"):  # those of `emit` are right for multiples of pi/2 of 20 bits
-            ours, theirs = ours[np.abs(points[:, 0]) < 5e5], theirs[np.abs(points[:, 0]) < 5e5]
-        close = 0.0 if op in EXACT else 2e-13  # XLA's own functions are right to 1e-13
-        right = np.isclose(ours, theirs, rtol=close, atol=0.0, equal_nan=True)
-        assert right.all(), (op, points[: len(ours)][~right][0], ours[~right][0], theirs[~right][0])
 
 
 def test_numbers_below_the_normal_ones_count_as_zero_or_as_what_they_are():

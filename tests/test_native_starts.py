@@ -51,21 +51,6 @@ def _same(found, expected, tolerance=1e-11):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_all_models_come_onto_the_rows_alike_and_lanes_do_not_see_each_other(name):
-    scene = MODELS[name]()
-    q, u = _near_rows(scene, 9)
-    ours, theirs = (
-        jax.jit(jax.vmap(lambda q, u, native=native: _put(native)(scene, q, u)))(q, u)
-        for native in (True, False)
-    )
-    _same(ours, theirs)
-    for lane in (0, 7):  # by itself, in narrow registers
-        alone = jax.jit(lambda q, u: _put(True)(scene, q, u))(q[lane], u[lane])
-        assert_array_equal(alone.q, ours.q[lane])
-        assert_array_equal(alone.u, ours.u[lane])
-
-
-@pytest.mark.parametrize("name", MODELS)
 def test_named_starts_of_all_models_are_alike(name):
     scene = MODELS[name]()
     theirs, ours = (jj.start(jj.build(scene, backend=backend), scene.example) for backend in BACKENDS)
@@ -132,53 +117,6 @@ def test_what_is_held_does_not_move():
     for names, given, found in ((BICYCLE.coordinate_names, q, ours.q), (BICYCLE.speed_names, u, ours.u)):
         places = [k for k, name in enumerate(names.entries) if name in held]
         assert_array_equal(np.asarray(found)[:, places], np.asarray(given)[:, places])
-
-
-class Driven(jj.Scene):
-    """A rod on a floor that moves, with a row that an input turns: rows of time and inputs, a quaternion, and
-    a mass matrix that is full.
-    """
-
-    length: float = jj.parameter(0.7, positive=True)
-    moments: jnp.ndarray = jj.parameter(jnp.array([0.3, 0.5, 0.4]), unit="kg m^2")
-
-    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
-    inputs = jj.inputs("turn")
-
-    def bodies(self, t, q):
-        R = jj.quaternion_to_matrix(q.attitude)
-        return {
-            "rod": jj.RigidBody(
-                1.5, self.moments, jnp.stack([q.x, q.y, 0.3 * jnp.sin(t) * q.x]) + self.length * R[:, 2], R
-            )
-        }
-
-    def geometric_constraints(self, pose):
-        return {"height": pose["rod"].position[2] - 0.5 * jnp.cos(pose.t)}
-
-    def velocity_constraints(self, motion):
-        rod = motion["rod"]
-        return {"edge": rod.velocity @ rod.orientation[:, 1] - motion.inputs.turn * self.length}
-
-
-@pytest.mark.parametrize("scene", [Driven(), BICYCLE], ids=small_scenes.name_of)
-def test_derivatives_of_starts_are_those_by_xla(scene):
-    (q,), (u,) = _near_rows(scene, 1)
-    point = jax.tree.map(lambda x: jnp.asarray(x, float), scene), q, u
-
-    def end(native, x):
-        state = _put(native)(*x)
-        return jnp.sum(jnp.sin(state.q)) + jnp.sum(state.u**2)
-
-    along = jax.tree.map(jnp.ones_like, point)
-    for derivative in (jax.grad, lambda f: lambda x: jax.jvp(f, (x,), (along,))):
-        _same(
-            *(
-                eval_numpy(derivative(lambda x, native=native: end(native, x)))(point)
-                for native in (True, False)
-            ),
-            1e-10,
-        )
 
 
 def test_where_machine_code_is_not_taken():

@@ -43,13 +43,6 @@ def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression(
     assert_allclose(profile.high - FITTED[1], STUDENT * ERRORS[1], rtol=0.02)
 
 
-def test_a_channel_with_a_known_sigma_keeps_its_own_beside_one_that_has_none():
-    other = 0.4 * np.random.default_rng(1).normal(size=6)
-    found = jj.fit(Bead(), run({"x": LINE, "y": other}, {"x": None, "y": 0.4}, (*BOTH, "y", "y_rate")))
-    reach = np.concatenate([STUDENT * ERRORS, NORMAL * 0.4 * UNIT])
-    assert_allclose(found.high - found.values, reach, rtol=1e-5)
-
-
 def test_what_priors_tell_is_not_taken_from_the_samples():
     prior = {"x": Normal(1.0, 0.03), "x_rate": Normal(2.0, 0.1)}
 
@@ -143,29 +136,6 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
     assert_allclose(*errors, rtol=1e-6)
 
 
-def test_a_robust_loss_does_not_widen_what_a_prior_tells():
-    ts, noise = np.linspace(0.0, 1.0, 12), np.random.default_rng(4)
-    y, sure = 1 + 2 * ts + 0.1 * noise.standard_t(4, size=12), Normal(2.0, 1e-3)
-    found = jj.fit(Bead(), run({"x": y}, 0.05, {"x": None, "x_rate": sure}, ts), loss=student_t())
-    assert_allclose(found["run 0: x_rate"].standard_error, 1e-3, rtol=1e-3)
-    r = np.asarray(found.residuals[0]["x"])
-    psi, slope = 5 * r / (4 + r**2), 5 * (4 - r**2) / (4 + r**2) ** 2
-    p = 12 - float(found.degrees_of_freedom)
-    assert_allclose(p, 1.0, rtol=1e-2)
-    # Huber and Ronchetti (2009), section 7.6, of a mean; J'J from the weighted one
-    K = 1 + p / 12 * np.var(slope) / np.mean(slope) ** 2
-    variance = (
-        K**2
-        * np.sum(psi**2)
-        / (12 - p)
-        / np.mean(slope) ** 2
-        * np.mean(5 / (4 + r**2))
-        / np.sum(5 / (4 + r**2))
-        * 0.05**2
-    )
-    assert_allclose(found["run 0: x"].standard_error, np.sqrt(variance), rtol=1e-2)
-
-
 @pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
 def test_a_repeat_without_samples_has_not_converged(sigma):
     found = jj.fit_batch(Bead(), run({"x": np.stack([LINE, np.full(6, np.nan)])}, sigma))
@@ -205,13 +175,3 @@ def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_si
         profile = found.profiles(data)["run 0: x_rate"]
         assert (profile.kind, profile.is_closed) == ("one-sided", (False, True))
         assert_allclose(profile.high - slope, reach, rtol=0.02)
-
-
-def test_a_bound_that_decides_is_named_where_its_misfit_counts_as_noise():
-    slope = FITTED[1]
-    for sigma, error in SLOPES.items():
-        for far in (2.0, 8.0):
-            bounded = jj.Estimate(slope + 10 * error, range=jj.bounds(slope + far * error, 90.0))
-            found = jj.fit(Bead(), run({"x": LINE}, sigma, {"x": None, "x_rate": bounded}))
-            assert_allclose(found.beyond[1], far, rtol=1e-4)
-            assert any("decides its value" in sentence for sentence in found.warnings) == (far > 3)

@@ -17,12 +17,11 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.equations.gibbs_appell import accelerations_of, minimal_kinematics
-from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
+from jourdain_jax.models import ChaplyginSleigh
 from jourdain_jax.program.calls import interpret_with_calls
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes
-from jourdain_jax.structure.trace import event_values
 
 
 def by_table(force, numbers):
@@ -147,21 +146,6 @@ def rates_of(scene):
     return by_program, dense
 
 
-@pytest.mark.parametrize(
-    "law", [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x)], ids=["softplus", "sinc"]
-)
-def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
-    scene = Acted(law=law)
-    assert "which has a custom derivative" in jj.lower(scene).calls[0]
-    (by_program, dense), (q, y) = rates_of(scene), (jnp.zeros(3), jnp.zeros(2))
-    first, second = (
-        [jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)]
-        for d in (jax.jacfwd, jax.hessian)
-    )
-    assert_allclose(*first, rtol=1e-12, atol=1e-12)
-    assert_allclose(*second, rtol=1e-12, atol=1e-12)
-
-
 def states_of(scene, count):
     _, q, u = jj.sample_states(scene, count)
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])
@@ -225,45 +209,6 @@ def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_dens
         )
 
 
-class OnCam(jj.Scene):
-    """A bead whose height is a function of where it is."""
-
-    height: Callable = eqx.field(static=True)
-    mass: float = jj.parameter(1.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, [q.x, 0.0, self.height(q.x)])}
-
-
-def by_large_product(x):
-    """One sine."""
-    return jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(x + jnp.arange(40.0)))
-
-
-@pytest.mark.parametrize(
-    ("scene", "reason"),
-    [
-        (OnCam(by_large_product), "a matrix product with 1600 multiplications"),
-        (OnCam(jax.nn.softplus), "`logaddexp`, which has a custom derivative,"),
-    ],
-    ids=["product", "rule"],
-)
-def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, reason):
-    assert set(jj.lower(scene).calls) == {reason}
-    q, y = np.random.default_rng(4).uniform(-1.0, 1.0, (2, 6, 1)) + np.array([[[0.1]], [[2.0]]])
-    by_program, dense = rates_of(scene)
-    for derivative in (
-        lambda f: f,
-        lambda f: jax.jacfwd(f, argnums=(1, 2)),
-        lambda f: jax.jacrev(f, argnums=(1, 2)),
-    ):
-        found, expected = (
-            jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense)
-        )
-        jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
-
-
 class Effective(OnLine):
     """A load that prints."""
 
@@ -309,34 +254,6 @@ def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources
     assert said == f"a scalar program of {program.operations} operations; {why}"
     for printed in (program.python_source, program.c_source):
         refused(r"calls of JAX \(the operation `while`\) cannot be written as source", printed)
-
-
-class WatchedDisc(TiltingDisc):
-    """Stops by a condition that has no scalar form."""
-
-    def events(self, motion):
-        return {"far": 0.5 - jnp.linalg.svd(jnp.stack([motion.q.x, motion.q.y])[None], compute_uv=False)[0]}
-
-
-def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_it_is():
-    watched = WatchedDisc()
-    program = jj.lower(watched)
-    assert program.operations == jj.lower(TiltingDisc()).operations
-    assert program.calls == ("the operation `svd`",)
-    (t,), (q,), (u,) = jj.sample_states(watched, 1)
-    values = program.values(
-        program.events,
-        program.fixed_values(watched),
-        t,
-        tuple(q),
-        tuple(u[np.array(program.independent)]),
-        jnp.zeros(0),
-    )
-    assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
-    found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
-    assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
-    lanes = jj.rollout(watched, {"lean": np.full(3, 0.1), "spin_rate": -3.0}, t1=2.0)
-    assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)
 
 
 # On the graph.
