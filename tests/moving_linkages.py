@@ -77,37 +77,6 @@ class SliderCrank(jj.Scene):
         return pinned("pin", end_of(pose["rod"], jnp.asarray(0.5)), pose["slider"].position)
 
 
-def slider_crank_motion(a_0, rate, ts, slider=0.5):
-    """Angle a (rad) of `SliderCrank` at times `ts` on its branch b = -a, by quadrature of the energy.
-
-    T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the
-    rod: (3/2 cos a, 1/2 sin a).
-    """
-    from scipy.integrate import solve_ivp
-
-    def inertia(a):
-        return (
-            1 / 12
-            + 1 / 4
-            + 1 / 12
-            + (1.5 * np.sin(a)) ** 2
-            + (0.5 * np.cos(a)) ** 2
-            + 4 * slider * np.sin(a) ** 2
-        )
-
-    momentum = np.sqrt(inertia(a_0)) * rate  # sqrt(I) a' is constant
-    found = solve_ivp(
-        lambda t, a: momentum / np.sqrt(inertia(a)),
-        (0.0, ts[-1]),
-        [a_0],
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-        t_eval=ts,
-    )
-    return found.y[0]
-
-
 class NarrowPendulum(jj.Scene):
     """A pendulum in Cartesian coordinates whose domain says that it hangs: the speed of z follows from that
     of x, but for a motion that reaches z = 0.

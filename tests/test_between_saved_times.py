@@ -3,11 +3,10 @@ step by no more than an error.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
-from moving_linkages import NarrowPendulum, Parallelogram, SliderCrank, slider_crank_motion
+from moving_linkages import NarrowPendulum, Parallelogram
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
@@ -16,20 +15,6 @@ SPEEDS = np.linspace(
     5.0, 10.0, 16
 )  # of the pendulum's x, m/s: some swing beyond the horizontal, some go round
 END = np.array([2.0])
-
-
-def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
-    pendulum, ts = NarrowPendulum(), jnp.asarray(END)
-    lanes = jax.jit(
-        jax.vmap(
-            lambda v: jj.simulate(
-                pendulum, jj.start(pendulum, x=0.3, z=-np.sqrt(0.91), x_rate=v), ts=ts, rtol=1e-6, atol=1e-6
-            )
-        )
-    )
-    assert np.all(np.asarray(lanes(SPEEDS).result) == results.SINGULAR_PARTITION)
-    slow = lanes(np.linspace(0.1, 1.0, 4))  # these stay inside
-    assert np.all(np.asarray(slow.result) == results.SUCCESS)
 
 
 @pytest.mark.parametrize(
@@ -52,36 +37,6 @@ def test_every_way_of_integrating_watches_its_pivots(options):
     assert np.all(asked.result == results.SINGULAR_PARTITION)
 
 
-class BladeTwice(jj.Scene):
-    """A blade whose row is stated twice; its speed along x determines that along y until it heads along y."""
-
-    coordinates = jj.coordinates("x y heading")
-    privileged = ("x_rate", "heading_rate")
-
-    def bodies(self, t, q):
-        return {"blade": jj.RigidBody(1.0, 0.4 * jnp.ones(3), [q.x, q.y, 0.0], jj.rot_z(q.heading))}
-
-    def velocity_constraints(self, motion):
-        blade = motion["blade"]
-        row = jj.knife_edge(blade, blade.position, blade.orientation[:, 1])
-        return {"once": row, "twice": 2.0 * row}
-
-
-def test_rows_stated_twice_hide_no_singular_partition():
-    options = {
-        "ts": [0.5, 2.0],
-        "formulation": jj.Formulation("minimal"),
-        "backend": "dense",
-        "rtol": 1e-6,
-        "atol": 1e-6,
-    }
-    motion = jj.simulate(BladeTwice(), {"x_rate": 1.0, "heading_rate": 1.0}, **options)
-    assert_allclose(
-        motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5
-    )  # a circle, heading along y at pi/2
-    assert motion.result == results.SINGULAR_PARTITION
-
-
 def _parallelograms(count, **options):
     w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
     starts = {"a": a_0, "b": 0.0, "c": a_0, "a_rate": w, "b_rate": 0.0, "c_rate": w}
@@ -98,26 +53,6 @@ def test_a_parallelogram_passes_flat_on_its_branch_or_is_flagged(rtol):
     arrived = result == results.SUCCESS
     assert np.mean(arrived) > 0.6
     assert np.all(error[arrived] < 100 * rtol)
-
-
-def test_steps_of_constant_length_that_lose_their_rows_are_flagged():
-    result, error = _parallelograms(32, solver=jj.ImplicitMidpoint(step=0.01), max_steps=2000)
-    arrived = result == results.SUCCESS
-    assert np.all(error[arrived] < 1e-3)
-
-
-@pytest.mark.parametrize("options", [{}, {"backend": "dense"}], ids=["lowered", "dense"])
-def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_flagged(options):
-    count = 64 if not options else 8
-    w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
-    starts = {"a": 0.5, "b": -0.5, "x": 2 * np.cos(0.5), "a_rate": w}
-    found = jj.rollout(SliderCrank(), starts, ts=ts, formulation=jj.Formulation("full"), **options)
-    arrived = found.result == results.SUCCESS
-    assert np.mean(arrived) > 0.6
-    for lane in np.flatnonzero(arrived):
-        a = slider_crank_motion(0.5, w[lane], ts)
-        error = np.abs(np.asarray(found.lanes.q[lane]) - np.stack([a, -a, 2 * np.cos(a)], axis=-1))
-        assert np.max(error) < 1e-5, f"a_rate = {w[lane]}"
 
 
 @pytest.mark.parametrize("backend", ["auto", "dense"])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from code_map import MOST_FILES
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -99,30 +99,6 @@ def test_a_function_whose_global_or_closure_has_changed_is_another_function():
     K = 2.0
 
 
-# forces, and their integrals from 0 to 1
-FORCES = [
-    (lambda t: t**2, 1 / 3),
-    (lambda t: t**3, 1 / 4),
-    (lambda t: jnp.where(t < 0.5, 1.0, 0.0), 1 / 2),
-    (lambda t: jnp.where(t < 0.5, 2.0, 0.0), 1.0),
-    (lambda t: 3.0, 3.0),
-    (lambda t: t - 1.0, -1 / 2),
-    (lambda t: 1.0 - t, 1 / 2),
-    (lambda t: -t, -1 / 2),
-    (lambda t: jnp.maximum(t, 0.5), 5 / 8),
-    (lambda t: jnp.maximum(t, 0.25), 17 / 32),
-    (lambda t: t / 4.0, 1 / 8),
-    (lambda t: 4.0 / (t + 1.0), 4 * np.log(2.0)),
-]
-
-
-def test_functions_that_differ_are_told_apart():
-    """The speeds at 1 s of a mass of 1 kg are the integrals of the two forces on it."""
-    for (f, along_x), (g, along_y) in zip(FORCES[:6], FORCES[6:], strict=True):
-        motion = jj.simulate(Pushed(stiffness=0.0), {}, ts=TS, inputs={"f": f, "g": g})
-        assert_allclose(motion.u_end, [along_x, along_y], atol=1e-7)
-
-
 def test_a_function_of_time_serves_outside_of_jit_and_inside_in_turn():
     def force(t):
         return 2.0 * jnp.sin(t)
@@ -173,17 +149,6 @@ def test_a_warm_call_from_python_is_short():
     assert len(files) <= MOST_FILES["warm"], files
 
 
-def test_what_is_kept_of_a_scene_is_kept_by_the_values_of_its_parameters():
-    def ends(radius):
-        disc = jj.models.TiltingDisc(radius=radius)
-        return np.asarray(jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), ts=TS).q_end)
-
-    small, large = ends(0.4), ends(0.8)
-    assert np.max(np.abs(small - large)) > 1e-2
-    assert_array_equal(ends(0.4), small)
-    assert_array_equal(ends(0.8), large)
-
-
 LOSSES = {
     "default": {},
     "dense": {"backend": "dense"},
@@ -195,42 +160,3 @@ LOSSES = {
 def test_gradients_reach_what_an_input_function_closes_over_without_jit(options):
     slope = jax.grad(lambda k: moved(lambda t: k * jnp.sin(t), **options)["x"][-1])(1.5)
     assert_allclose(slope, pulled(1.0) - pulled(0.0), rtol=1e-5)
-
-
-def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
-    expected = pulled(1.0) - pulled(0.0)
-
-    def end(k):
-        return moved(lambda t: jax.jit(lambda t: k * jnp.sin(t))(t))["x"][-1]
-
-    def lanes(k):
-        found = jj.rollout(
-            Pushed(), {"x": np.array([0.1, 0.2])}, ts=TS, inputs={"f": lambda t: k * jnp.sin(t)}
-        )
-        return jnp.sum(found["x"][:, -1]) / 2
-
-    assert_allclose(jax.vmap(end)(jnp.array([0.0, 1.5])), [pulled(0.0), pulled(1.5)], atol=1e-7)
-    for slope in (jax.jacfwd(end), jax.jit(jax.grad(end)), jax.grad(lanes)):
-        assert_allclose(slope(1.5), expected, rtol=1e-6)
-
-
-def test_motions_go_on_after_the_precision_is_switched():
-    def run():
-        motions = (
-            jj.simulate(jj.models.DoublePendulumRods(), t1=0.1, rtol=1e-5, atol=1e-5),
-            moved(lambda t: jnp.sin(t), rtol=1e-5, atol=1e-5),
-        )
-        assert all(motion.succeeded for motion in motions), str(motions[0])
-        return [np.asarray(motion.q_end) for motion in motions]
-
-    double = run()
-    assert jax.config.jax_enable_x64
-    try:
-        jax.config.update("jax_enable_x64", False)
-        single = run()
-    finally:
-        jax.config.update("jax_enable_x64", True)
-    for a, b, again in zip(double, single, run(), strict=True):
-        assert (a.dtype, b.dtype) == (np.float64, np.float32)
-        assert_allclose(b, a, atol=1e-3)
-        assert_array_equal(again, a)

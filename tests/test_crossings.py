@@ -143,27 +143,6 @@ def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_deriv
         assert_allclose(slope, v, atol=1e-12)
 
 
-BY_PLACE = {
-    "Whole": jax.grad,
-    "Rounded": jax.jacfwd,
-    "Stripes": jax.grad,
-    "Select": jax.jacfwd,
-    "Relu": jax.grad,
-}
-
-
-@pytest.mark.parametrize("kind", BY_PLACE)
-def test_derivatives_by_the_place_are_those_of_a_shift(kind):
-    """What acts moves by da: beyond it the motion has another speed v', and x moves by (1 - v') da."""
-
-    def end(a):
-        return motion(OTHER[kind].replace(a=a)).q_end[0]
-
-    speed = motion(OTHER[kind], max_step=0.01).u_end[0]
-    assert abs(speed - 1.0) > 0.01
-    assert_allclose(jax.jit(BY_PLACE[kind](end))(0.7), 1.0 - speed, rtol=0, atol=1e-8)
-
-
 class Cart(Sliding):
     inputs = jj.inputs("push")
 

@@ -27,71 +27,6 @@ from jourdain_jax.integrate.explicit_steps import DOPRI5, DOPRI8, TSIT5, method_
 GRAVITY = 9.81
 
 
-class Falling(OnLine):
-    """A mass above the ground, which may push it."""
-
-    depth: float = jj.parameter(0.05)
-    stiffness: float = jj.parameter(0.0)
-
-    def push(self, x):  # k x^9.5 above -depth, zero below it, where reverse mode divides by sqrt(0)
-        return self.stiffness * x**9 * jnp.sqrt(jnp.maximum(x, 0.0))
-
-    def loads(self, motion):
-        return jj.generalized_force(motion, x_rate=-GRAVITY + self.push(motion.q.x + self.depth))
-
-    def events(self, motion):
-        return {"ground": motion.q.x}
-
-
-def fallen(height, scene=None, **options):
-    return jj.simulate(
-        scene or Falling(),
-        {"x": height},
-        **({"t1": 2.0, "backend": "xla", "rtol": 1e-9, "atol": 1e-9} | options),
-    )
-
-
-def test_lanes_have_saved_times_of_their_own():
-    heights, ts = jnp.array([0.5, 9.0]), jnp.array([[0.0, 0.1, 0.2, 1.0, 1.1], [0.1, 0.2, 0.3, 0.4, 0.5]])
-    expected = np.maximum(heights[:, None] - GRAVITY * ts**2 / 2, 0.0)
-
-    def seen(heights):
-        q = jax.vmap(lambda height, ts: fallen(height, ts=ts).q[:, 0])(heights, ts)
-        return q, q
-
-    slopes, q = jax.jit(jax.jacrev(seen, has_aux=True))(heights)
-    assert_allclose(np.nan_to_num(q), expected, atol=1e-9)
-    assert_allclose(np.nan_to_num(jnp.sum(slopes, axis=2)), expected > 0, atol=1e-9)
-
-
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()], ids=["Dopri8", "Tsit5"])
-def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
-    def fall_time(height):
-        return fallen(height, solver=solver).t_end
-
-    height = 2.0
-    exact = np.sqrt(2 * height / GRAVITY)
-    for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):
-        assert_allclose(fall_time(height), expected, rtol=1e-9)
-        fall_time = jax.jacfwd(fall_time)
-
-
-def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
-    scene, height = Falling(stiffness=5e-3), 2.0
-
-    def landing_speed(height):
-        return fallen(height, scene, solver=diffrax.Tsit5()).u_end[0]
-
-    # v^2/2 + g z - k (z + d)^10.5/10.5 is constant
-    work = lambda z: GRAVITY * z - scene.stiffness * (z + scene.depth) ** 10.5 / 10.5
-    speed = np.sqrt(2 * (work(height) - work(0.0)))
-    assert np.isnan(jax.grad(scene.push)(-scene.depth))
-    assert_allclose(landing_speed(height), -speed, rtol=1e-9)
-    assert_allclose(
-        jax.grad(landing_speed)(height), -(GRAVITY - scene.push(height + scene.depth)) / speed, rtol=1e-7
-    )
-
-
 SHAPES = ("flat", "jump", "kinked", "saturated", "steep", "straight")
 
 
@@ -330,35 +265,6 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
 
 
-# where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t +
-# c
-MEETS = {
-    "floor": (0.6, lambda place: (-GRAVITY / 2, 2.0, 1.0 - place)),
-    "wall": (0.8, lambda place: (0.0, -4.5, place)),
-    "roof": (1.1, lambda place: (GRAVITY / 2, -2.0, place - 1.0)),
-    "slope": (1.9, lambda place: (GRAVITY / 2, -6.5, place - 1.0)),
-}
-
-
-@pytest.mark.parametrize("plane", MEETS)
-def test_the_second_derivative_of_one_of_several_events_is_its_own(plane):
-    place, value = MEETS[plane]
-
-    def end(place):
-        walls = {"floor": -9.0, "wall": 9.0} | {plane: place}
-        motion = jj.simulate(Thrown(**walls), {"z": 1.0, "x_rate": 4.5, "z_rate": 2.0}, t1=1.0)
-        return jnp.stack([motion.t_end, *motion.q_end])
-
-    def closed(place):
-        a, b, c = value(place)
-        t = 2 * c / (-b + jnp.sqrt(b**2 - 4 * a * c))
-        return jnp.stack([t, 4.5 * t, 1.0 + 2.0 * t - GRAVITY * t**2 / 2])
-
-    assert_allclose(end(place), closed(place), rtol=1e-9)
-    found, expected = (jax.jit(jax.hessian(f))(place) for f in (end, closed))
-    assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
-
-
 class Bounded(OnLine):
     """A particle without forces; event values that are no numbers beyond edges of their own."""
 
@@ -443,20 +349,6 @@ def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_the
     assert_allclose(slope, 1 / np.sqrt(2 * GRAVITY * by), rtol=1e-4)
 
 
-def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
-    class Wrong(Thrown):
-        def loads(self, motion):
-            return jj.gravity(motion, GRAVITY * jnp.sqrt(motion.q.z - 0.9))
-
-    with jax.debug_nans(True):
-        motion = jj.simulate(Thrown(), t1=5.0)
-        assert motion.result == results.EVENT
-        assert np.isnan(np.asarray(motion["x"])[-1])
-        assert "stopped at an event" in str(motion)
-        with pytest.raises(FloatingPointError):
-            jj.simulate(Wrong(), t1=5.0)
-
-
 WITH_MARKS = {
     "energies": lambda motion, path: motion.energies().balance,
     "a point": lambda motion, path: motion.point("mass", jnp.zeros(3)),
@@ -511,16 +403,6 @@ def test_bounces_go_on_from_the_end(backend, level):
         expected += 2 * fall * restitution**k
         assert motion.event_names[int(motion.event)] == "floor"
         assert abs(motion.t_end - expected) < 1e-9 * max(1.0, level)
-
-
-def test_lanes_and_jit_start_at_an_event():
-    starts = {"x": 0.0, "z": 0.0, "z_rate": jnp.array([3.0, 1e-3, 0.0, -1.0]), "x_rate": 0.1}
-    lanes = jj.rollout(Ball(), starts, ts=[2.0]).lanes
-    assert_array_equal(lanes.result, results.EVENT)
-    assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
-    assert jnp.sum(lanes.accepted[2:]) == 0
-    one = jax.jit(lambda rate: jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0]).t_end)(2.0)
-    assert abs(float(one) - 4 / GRAVITY) < 1e-9
 
 
 def test_back_in_time_a_value_rises_where_its_rate_is_negative():
@@ -607,11 +489,3 @@ def test_a_value_of_zero_at_the_start_falls_by_the_first_derivative_that_is_not_
         else (lanes.t_end, lanes.event >= 0)
     )
     assert_allclose(np.where(happened, np.abs(times), np.inf), expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
-def test_a_motion_that_sets_off_from_its_event_has_derivatives(derivative):
-    def moved(push):
-        return jj.simulate(AtLevel(push=push), {"x": 0.0}, t1=2.0).q_end[0]
-
-    assert_allclose(jax.jit(derivative(moved))(2.0), 2.0, rtol=1e-6)
