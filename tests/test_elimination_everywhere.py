@@ -10,21 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
-from generated_robots import BeadOnCurve, PlanarRobot, drawn
+from generated_robots import PlanarRobot, drawn
 from numpy.testing import assert_allclose
 from solved_states import over_states
 from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
-from jourdain_jax.models import MODELS, TrailerChain
+from jourdain_jax.models import MODELS
 
 # The scalar program divides by nothing that vanishes where the rows themselves determine the speeds: at any
 # heading, with no mass, with dependent
-
-
-WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}
-ROBOT = {"left_rate": 3.0, "right_rate": 20.0}
 
 
 @pytest.mark.parametrize("seed", [1, 3, 5, 12, 15])
@@ -44,114 +40,12 @@ def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
             assert np.all(np.abs(np.array(pivots)) > 0.02)
 
 
-def motion_and_reference(scene, start, t1, *, traced=(), **options):
-    """Under `jit`, `traced` parameters traced as well, and by dense matrices."""
-
-    def run(values, start):
-        return jj.simulate(
-            scene.replace(**values) if values else scene,
-            start,
-            ts=jnp.linspace(0.0, t1, 9),
-            rtol=1e-10,
-            atol=1e-10,
-            work=False,
-            **options,
-        )
-
-    values = {name: getattr(scene, name) for name in traced}
-    reference = jj.simulate(
-        scene,
-        start,
-        ts=[t1],
-        formulation=jj.Formulation("full"),
-        backend="dense",
-        rtol=1e-11,
-        atol=1e-11,
-        work=False,
-    )
-    return jax.jit(run)(values, jj.start(scene, **start)), reference
-
-
-class LightKnee(jj.Scene):
-    """A pendulum with a knee of no mass half-way, in Cartesian coordinates: at right angles no two speeds
-    determine the others, and M is singular.
-    """
-
-    knee: object = jj.parameter(0.0, unit="kg", non_negative=True)
-    coordinates = jj.coordinates("x z x_end z_end")
-    domain = {"x": (-0.9, 0.9), "z": (-1.2, 1.0), "x_end": (-0.9, 0.9), "z_end": (-2.2, 2.0)}
-
-    def bodies(self, t, q):
-        o = 0 * q.x
-        return {"knee": jj.Particle(self.knee, [q.x, o, q.z]), "bob": jj.Particle(1.0, [q.x_end, o, q.z_end])}
-
-    def geometric_constraints(self, pose):
-        q = pose.q
-        return {"rod": q.x**2 + q.z**2 - 1.0, "straight": jnp.stack([q.x_end - 2 * q.x, q.z_end - 2 * q.z])}
-
-    def loads(self, motion):
-        return jj.gravity(motion, 9.81, (0.0, 0.0, -1.0))
-
-
 class Twice(PlanarRobot):
     """The robot with a row written twice, at another scale."""
 
     def velocity_constraints(self, m):
         rows = super().velocity_constraints(m)
         return rows | {"again": -3.0 * rows["left"]}
-
-
-KNEE = {"x": 0.6, "z": -0.8, "x_end": 1.2, "z_end": -1.6, "x_rate": 4.0}
-# scene, start, parameters that are traced
-SERVED = {
-    "full turns of a bead": (BeadOnCurve(), BeadOnCurve().start(), ()),
-    "full turns of a robot with a trailer": (
-        PlanarRobot(trailers=1, turned=0.4),
-        PlanarRobot(trailers=1).start(**ROBOT),
-        (),
-    ),
-    "massless trailer of a robot": (
-        PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS),
-        PlanarRobot(trailers=1, maximal=True).start(**ROBOT),
-        WEIGHTLESS,
-    ),
-    "massless trailer of a car": (
-        TrailerChain(trailers=1, **WEIGHTLESS),
-        TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8),
-        WEIGHTLESS,
-    ),
-    "a massless body that rows hold": (LightKnee(), KNEE, ("knee",)),
-    "its mass": (LightKnee(knee=0.7), KNEE, ("knee",)),
-    "dependent rows": (Twice(turned=0.3), PlanarRobot().start(**ROBOT), ("turned",)),
-}
-
-
-@pytest.mark.parametrize("state", ["auto", "full"])
-@pytest.mark.parametrize("case", SERVED)
-def test_motions_are_served_by_one_program_in_both_forms_of_the_state(case, state):
-    scene, start, traced = SERVED[case]
-    motion, reference = motion_and_reference(
-        scene, start, 3.0, traced=traced, formulation=jj.Formulation(state)
-    )
-    assert motion.result == results.SUCCESS
-    assert "lowered" in motion.reduction
-    assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
-    assert motion.smallest_pivot > 0.1 or "turns" not in case
-
-
-def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
-    scene = PlanarRobot(trailers=1)
-    start = jj.start(scene, **scene.start(**ROBOT))
-    angles = jnp.array([0.0, 0.4, np.pi / 2, -2.0])
-    ends = jax.jit(
-        jax.vmap(
-            lambda a: jj.simulate(
-                scene.replace(turned=a), start, ts=[2.0], rtol=1e-10, atol=1e-10, work=False
-            )
-        )
-    )(angles)
-    assert np.all(np.asarray(ends.result) == results.SUCCESS)
-    assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
 
 
 def test_rows_that_repeat_others_in_another_scale_are_redundant():
@@ -219,15 +113,6 @@ def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
     assert same == y
 
 
-def test_a_motion_through_a_loss_of_rank_is_right():
-    board, options = MODELS["snakeboard"](), {"t1": (np.pi - 0.6) / 0.5}
-    start = jj.start(board, steer=0.3, steer_rate=0.5, heading_rate=0.2)
-    beyond = jj.simulate(board, start, rtol=1e-9, atol=1e-9, retry=True, **options)
-    dense = jj.simulate(board, start, rtol=1e-11, atol=1e-11, backend="dense", **options)
-    assert beyond.result == int(dense.result) == results.SUCCESS
-    assert_allclose(beyond.u_end, dense.u_end, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", ["skate", "chaplygin-sleigh", "isokinetic-particle"])
 def test_which_scenes_keep_all_speeds(name):
     scene = MODELS[name]()
@@ -268,21 +153,6 @@ class CarAtItsMiddle(jj.Scene):
         }
 
 
-@pytest.mark.parametrize("bases", [[2.6], [2.6 * (1 + 1e-9)], [2.0, 2.6, 2.6 * (1 - 1e-7), 2.6 * (1 + 1e-4)]])
-def test_no_pivot_is_a_coefficient_that_vanishes_for_the_given_parameters(bases):
-    class Fresh(CarAtItsMiddle):  # a class of its own, for which no pivots have been chosen before
-        pass
-
-    for base in bases:
-        scene = Fresh(base=base)
-        start = jj.start(scene, x_rate=1.0, steer=0.2)
-        motion = jj.simulate(scene, start, t1=1.0)
-        assert motion.succeeded
-        front = 1.3 + 0.5 * base  # from the rear blade to the front one, m
-        assert_allclose(start["heading_rate"], np.tan(0.2) / front, rtol=1e-12)
-        assert_allclose(motion["heading"][-1], motion["heading_rate"][0], rtol=1e-9)
-
-
 class Geared(jj.Scene):
     """A disc that a gear turns; the ratio `base/2 - 1.3` is the only coefficient of the dependent speed."""
 
@@ -314,10 +184,9 @@ def test_the_only_pivot_is_a_code_where_its_terms_nearly_cancel(backend):
     assert_allclose(turn[5:], rate[5:], rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("backend", ["native", "xla"])
-def test_lengths_near_those_at_which_a_coefficient_vanishes_are_right(backend, seed):
-    draws = np.random.default_rng(seed)
+def test_lengths_near_those_at_which_a_coefficient_vanishes_are_right(backend):
+    draws = np.random.default_rng(0)
     scene = CarAtItsMiddle(base=3.0, share=float(draws.uniform(0.2, 0.8)))
     off = draws.choice([-1.0, 1.0], 24) * 10.0 ** draws.uniform(-14.0, -1.0, 24)
     bases = 2.6 * (1 + np.append(off, 0.0))
@@ -354,16 +223,13 @@ class SleighWithoutDefaults(jj.Scene):
         return {"blade": jj.knife_edge(body, body.place((-self.offset, 0.0, 0.0)), body.orientation[:, 1])}
 
 
-ORDERED = ("snakeboard", "double-pendulum-rods", "spring-and-rod", "pendulum-chain")
-OTHERS = {"car": CarAtItsMiddle(), "sleigh": SleighWithoutDefaults(1.3, 0.25), "gear": Geared()}
-
-
-@pytest.mark.parametrize("name", [*ORDERED, *OTHERS])
-def test_the_scene_of_a_class_that_comes_first_does_not_matter(name):
-    usual = OTHERS[name] if name in OTHERS else MODELS[name]()
+@pytest.mark.parametrize(
+    "usual", [MODELS["snakeboard"](), SleighWithoutDefaults(1.3, 0.25)], ids=["snakeboard", "sleigh"]
+)
+def test_the_scene_of_a_class_that_comes_first_does_not_matter(usual):
     leaves = jax.tree.leaves(usual)
     given = {f.name: getattr(usual, f.name) for f in fields(usual)[len(fields(jj.Scene)) :]}
-    draws = np.random.default_rng(sum(map(ord, name)))
+    draws = np.random.default_rng(0)
     sizes = [np.exp(spread * draws.uniform(-1.0, 1.0, len(leaves))) for spread in (0.0, 0.3, 0.3, 0.8)]
     sources, ends = set(), set()
     for order in ((1,), (0, 1), (3, 2, 1)):

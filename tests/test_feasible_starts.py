@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import linkages
-import moving_linkages
 import numpy as np
 import pytest
 import result_codes as results
@@ -84,25 +83,12 @@ class Hanging(InSpace):
         return {"rod": pose.q.array @ pose.q.array - 1.0}
 
 
-class Slider(SliderCrank):
-    """The crank above its slider or below it, as the domain says."""
-
-    domain = {"a": (-3.0, -0.1), "b": (0.0, 0.6), "x": (0.5, 3.5)}
-
-
 @pytest.mark.parametrize("given", [{}, {"x": 0.3}, {"x": 0.3, "y": -0.2}, {"x": 0.9, "y": 0.0}, {"y": 0.7}])
 def test_a_start_is_put_together_in_the_domain_that_its_scene_states(given):
     found = jj.start(Hanging(), given)
     assert found.residual < 1e-12
     assert -1.05 <= float(found["z"]) <= -0.1
     assert_allclose(jj.simulate(Hanging(), given, ts=[0.0, 0.01]).q[0], found.q, atol=1e-9)
-
-
-@pytest.mark.parametrize("x", [1.7, 2.1, 2.6, 2.9])
-def test_a_crank_stands_where_the_domain_has_its_slider(x):
-    found = jj.start(Slider(rod=2.0), x=x)
-    assert found.residual < 1e-9
-    assert -3.0 <= float(found["a"]) < 0 < float(found["b"]) <= 0.63
 
 
 def test_what_is_found_outside_of_the_domain_is_refused_unless_it_is_looked_for_there():
@@ -168,23 +154,6 @@ def test_parts_of_an_attitude_that_no_other_has_leave_the_rest_zero():
     assert_allclose(eval_numpy(jax.grad(lean))(half), -np.sin(2 * half), rtol=1e-9)
 
 
-def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
-    scene, places = SCENES["slider-crank"], np.array([-1.5, -1.2, 1.4, 2.5])
-
-    def crank(x):
-        state = jj.start(scene, x=x)
-        return state["a"], state.q
-
-    a, slope, q = eval_numpy(jax.vmap(lambda x: jax.jvp(crank, (x,), (1.0,), has_aux=True)))(places)
-    single = [jj.start(scene, x=x) for x in places.tolist()]
-    assert_allclose(q, np.stack([np.asarray(state.q) for state in single]), atol=1e-8)
-    assert max(int(state.guess) for state in single) > 0
-    # r^2 + x^2 - 2 r x cos(a) = l^2
-    expected = (np.cos(a) - places) / (places * np.sin(a))
-    assert_allclose(slope, expected, rtol=1e-7)
-    assert_allclose(jax.jit(jax.grad(lambda x: crank(x)[0]))(places[0]), expected[0], rtol=1e-7)
-
-
 class Hidden(InSpace):
     """A particle held by a row that is a number in a small disc of its domain only."""
 
@@ -200,63 +169,6 @@ def test_states_near_the_example_serve_where_none_was_found_at_random():
     refused(r"no admissible state .* or an `example` on the constraints", structure_of, Hidden())
     assert structure_of(Shown()).degrees_of_freedom == 2
     assert jj.start(Shown(), x=0.3, y=0.2, y_rate=1.0).residual < 1e-12
-
-
-def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
-    found = jj.steady(
-        jj.models.VerticalDisc(), {"x": 5.0, "heading": 0.7, "heading_rate": 0.2, "roll_rate": 3.0}
-    )
-    assert found.converged
-    assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)
-
-
-class Bowl(InSpace):
-    """A particle in a round bowl, which rolls along grooves: a geometric row that the reference is on, and a
-    row of speeds.
-    """
-
-    radius: float = jj.parameter(1.2, positive=True)
-    slope: float = jj.parameter(0.4)
-
-    coordinates = jj.coordinates("z y x")
-
-    def geometric_constraints(self, pose):
-        q = pose.q
-        return {"bowl": q.x**2 + q.y**2 + (q.z - self.radius) ** 2 - self.radius**2}
-
-    def velocity_constraints(self, motion):
-        return {"groove": motion.u.y_rate - self.slope * motion.q.x * motion.u.x_rate}
-
-
-@pytest.mark.parametrize("scene", [jj.models.ChaplyginSleigh(), Bowl()], ids=["sleigh", "bowl"])
-def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_nearest_one(scene):
-    """Speeds that rows determine are solved for without a metric; where a scene has none to spare, the
-    nearest state is that one, to second order.
-    """
-    first, privileged = (
-        scene.coordinate_names.entries[-1],
-        [scene.speed_names.entries[i] for i in structure_of(scene).independent],
-    )
-    given = {first: jnp.asarray(0.3)} | {name: jnp.asarray(0.5 + k) for k, name in enumerate(privileged)}
-    numbers, restored = ravel_pytree((jax.tree.map(jnp.asarray, scene), given))
-
-    def seen(state):
-        return jnp.sum(jnp.sin(jnp.arange(1.0, state.u.size + 1) * state.u)) + state.q @ state.q
-
-    def determined(x):
-        scene, given = restored(x)
-        return seen(jj.start(scene, **given))
-
-    def nearest(x):
-        scene, given = restored(x)
-        q, u, _ = scene.named(**given)
-        return seen(jj.consistent(scene, 0.0, q, u, held=tuple(given)))
-
-    def derivatives(f):
-        return eval_numpy(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x), jax.jacfwd(jax.grad(f))(x)))
-
-    for found, expected in zip(derivatives(determined)(numbers), derivatives(nearest)(numbers), strict=True):
-        assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_for_and_then_named():
@@ -325,25 +237,6 @@ def test_derivatives_are_those_of_what_is_computed(scene, held, off):
     forward = eval_numpy(jax.jacfwd(put))(0.0)
     assert_allclose(forward, _slope(eval_numpy(put)), atol=1e-8 * np.max(np.abs(forward)))
     assert_allclose(eval_numpy(jax.grad(lambda s: weights @ put(s)))(0.0), weights @ forward, rtol=1e-10)
-
-
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
-def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative):
-    """A longer rod moves the bob outwards, a rate along the rod is taken away: x = l sin a, z = -l cos a,
-    also where x, z and both rates are given.
-    """
-    sin, cos = 0.28, 0.96
-
-    def begins(length, along):
-        scene = moving_linkages.NarrowPendulum(length=length)
-        rates = {"x_rate": cos + along * sin, "z_rate": sin - along * cos}
-        state = jj.start(scene, {"x": sin, "z": -cos, **rates})
-        return jnp.concatenate([state.q, state.u])
-
-    assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
-    by_length, by_rate = eval_numpy(derivative(begins, argnums=(0, 1)))(1.0, 0.0)
-    assert_allclose(by_length, [sin, -cos, 0.0, 0.0], atol=1e-12)
-    assert_allclose(by_rate, np.zeros(4), atol=1e-12)
 
 
 def test_second_derivatives_are_differences_of_first_ones():
