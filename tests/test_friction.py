@@ -168,13 +168,6 @@ def settled(bounce, **options):
     return jj.simulate(Ball(bounce=bounce), {"z": 1.0285, "x_rate": 0.1}, ts=[0.4, 3.0], **options)
 
 
-def test_bounces_end_at_the_limit_of_their_series_on_arrays():
-    at_limit = lambda e: at_rest(settled(e, backend="xla"))
-    slope, time = with_value(jax.jacfwd, at_limit)(0.7)
-    assert_allclose(time, 2.55863396558581, rtol=1e-11)
-    assert_allclose(slope, 10.0338586885718, rtol=1e-9)
-
-
 def test_bounces_by_lanes_end_at_the_limits_of_their_series():
     def found(e):
         motion = settled(e)
@@ -195,47 +188,6 @@ class Tilted(Ball):
     def loads(self, motion):
         weight = self.mass * self.g * jnp.stack([jnp.sin(self.slope), jnp.zeros(()), -jnp.cos(self.slope)])
         return jj.Load(forces={"ball": weight})
-
-
-def by_hand(bounce, friction, t1):
-    """x, its rate and the time of rest of a ball that falls 0.5 m onto a slope of 0.2: 200 flights, then
-    rolling or slip. Impacts slip or stick.
-    """
-    down, up, R = G * jnp.sin(0.2), G * jnp.cos(0.2), 0.0285
-    t = jnp.sqrt(1.0 / up)
-    w, x, v, turn = up * t, down * t * t / 2, down * t, 0.0 * t
-
-    def bounces(_, state):
-        t, w, x, v, turn = state  # speed of impact; `turn`: rate about y
-        slip, most = v - R * turn, friction * (1 + bounce) * w
-        P = -jnp.clip(2 / 7 * slip, -most, most)
-        v, turn, w = v + P, turn - 2.5 * P / R, bounce * w
-        flight = 2 * w / up
-        return t + flight, w, x + v * flight + down * flight**2 / 2, v + down * flight, turn
-
-    t, _, x, v, turn = jax.lax.fori_loop(0, 200, bounces, (t, w, x, v, turn))
-    slip, held = v - R * turn, 2 / 7 * down
-    a, rest = down - jnp.where(slip > 1e-9, friction * up, held), t1 - t
-    return jnp.stack([x + v * rest + a * rest**2 / 2, v + a * rest, t])
-
-
-@pytest.mark.parametrize("friction", [0.5, 0.04])
-def test_a_ball_bounces_down_a_slope_and_goes_on(friction):
-    """It rolls, or slips to the end, after bounces; their sum has all their impulse of friction."""
-
-    def found(bounce):
-        scene = Tilted(bounce=bounce, friction=friction)
-        motion = jj.simulate(scene, {"z": 0.5285}, ts=[1.5, 1.9], **FINE)
-        values = jnp.stack([motion["x"][-1], motion["x_rate"][-1], at_rest(motion)])
-        return values, (values, motion.phase("cloth")[-1])
-
-    right = lambda bounce: by_hand(bounce, friction, 1.9)
-    slopes, values = with_value(jax.jacfwd, right)(0.55)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found_slopes, (found_values, phase) = jax.jit(derivative(found, has_aux=True))(0.55)
-        assert_allclose(found_values, values, rtol=1e-10)
-        assert_allclose(found_slopes, slopes, rtol=1e-9, atol=1e-12)
-        assert phase == (1 if friction > 0.1 else 2)
 
 
 class OnSphere(Heavy):
@@ -464,24 +416,6 @@ def test_a_coin_with_much_friction_rolls_as_one_that_cannot_slip():
     assert_allclose(free.u[0], kept.u[0], atol=1e-8)
 
 
-def test_small_motions_of_a_coin_with_much_friction_are_those_of_one_that_cannot_slip():
-    """On a circle, which is steady."""
-    rolling, names = RollingCoin(), ("attitude_turn_x", "attitude_turn_y", "attitude_turn_z")
-    start = jj.start(
-        rolling, attitude=(np.cos(0.15), np.sin(0.15), 0.0, 0.0), attitude_omega_y=30.0, near={"z": 0.0115}
-    )
-    right = jj.linearize(rolling, start, names)
-    entries = (*rolling.coordinate_names.entries, *rolling.speed_names.entries)
-    state = dict(zip(entries, [*start.q, *start.u], strict=True))
-    found = jj.linearize(Coin(friction=1e6), state, names)
-    for name in ("A", "M", "C", "K"):
-        right_one = getattr(right, name)
-        assert_allclose(getattr(found, name), right_one, atol=1e-12 * np.abs(right_one).max())
-    assert found.states == right.states
-    flying = jj.linearize(Coin(), state | {"z": 1.0})
-    assert len(flying.states) == 12
-
-
 def test_small_motions_of_a_ball_that_slips():
     """dv/dt = -mu g w/|w| with the slip w = v + omega x (-R n), and of omega by the same force."""
     speeds = ["x_rate", "y_rate", "attitude_omega_x", "attitude_omega_y"]
@@ -607,26 +541,6 @@ class Cart(Heavy):
             return jj.ball_contact(pose["cart"], 0.05, centre=(x, 0.0, -0.45), **law)
 
         return {"front": runner(0.6), "rear": runner(-0.4)}
-
-
-def test_carts_fall_as_they_may():
-    """Runners strike, open, slip, turn round and stick together; without loss of energy but by friction and
-    impacts, whatever the start.
-    """
-    draw, count = np.random.default_rng(0), 100
-    start = {
-        name: draw.uniform(*reach, count)
-        for name, reach in {
-            "z": (0.85, 1),
-            "pitch": (-0.5, 0.5),
-            "x_rate": (-2, 2),
-            "pitch_rate": (-2, 2),
-        }.items()
-    }
-    found = jj.rollout(Cart(bounce=0.5), start, ts=[0.5, 1.0], rtol=1e-8, atol=1e-8, max_transitions=400)
-    assert np.all(found.lanes.result == 0)
-    balance = jax.jit(jax.vmap(lambda lane: lane.energies().balance))(found.lanes)
-    assert_allclose(balance[:, 0], balance[:, 1], rtol=1e-7)
 
 
 def test_a_cart_brakes_on_two_runners():
@@ -773,26 +687,6 @@ class Scooter(Ball):
 SCOOTER = {"mass": 1.0, "radius": 0.1, "friction": 0.4, "bounce": 0.3}
 
 
-def test_bodies_dropped_on_two_contacts_in_space():
-    """Both contacts slip, stick and open together; where Newton's restitution would gain energy, a code says
-    so.
-    """
-    count = 60
-    draw = np.random.default_rng(0)
-    angle, height = draw.uniform(-0.25, 0.25, count), draw.uniform(0.0, 0.1, count)
-    attitude = np.stack([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=1)
-    speed, spin = draw.uniform(-1, 1, (2, count)), draw.uniform(-1, 1, (count, 3)) * [3, 1, 3]
-    start = {"z": 0.1 + 0.4 * np.abs(np.sin(angle)) + height, "attitude": attitude}
-    start |= {"x_rate": speed[0], "y_rate": speed[1], "attitude_omega": spin}
-    rollout = jj.rollout(Scooter(**SCOOTER), start, t1=1.5, rtol=1e-8, atol=1e-8)
-    reached = np.asarray(rollout.result) == 0
-    assert reached.sum() >= 0.9 * count
-    assert set(np.asarray(rollout.result)[~reached].tolist()) <= {19, 21, 24}
-    for lane in np.flatnonzero(reached)[:20]:
-        balance = rollout.lane(int(lane)).energies().balance
-        assert_allclose(balance, balance[0], atol=1e-6)
-
-
 def test_contacts_that_close_together_strike_together():
     """Dropped flat on both, the body stays level and slips by the impulse of both, in either order of the
     contacts.
@@ -857,92 +751,6 @@ def test_a_disc_that_falls_flat_has_a_code(bounce):
     motion = jj.simulate(Coin(bounce=bounce), {"z": 0.02, "attitude": attitude}, t1=1.0)
     assert "fell flat on its ground" in motion.message
     assert abs(motion.q_end[2]) < 1e-5
-
-
-class Braked(jj.Scene):
-    """A ball in a plane that slides over a strip which brakes it, and is stopped at a line; `at`, `width`: of
-    strip or line.
-    """
-
-    friction: float = jj.parameter(0.3)
-    at: float = jj.parameter(0.5)
-    width: float = jj.parameter(0.02)
-    brake: float = jj.parameter(0.0)
-    push: float = jj.parameter(0.0)
-    line: str = eqx.field(static=True, default="")
-    coordinates = jj.coordinates("x z turn")
-
-    def bodies(self, t, q):
-        return {"ball": jj.RigidBody(1.0, 0.1 * jnp.ones(3), [q.x, 0.0, q.z], jj.rot_y(q.turn))}
-
-    def contacts(self, pose):
-        return {"floor": jj.ball_contact(pose["ball"], 0.5, height="row", friction=self.friction)}
-
-    def loads(self, motion):
-        there = (motion.q.x > self.at) & (motion.q.x < self.at + self.width)
-        return (
-            jj.gravity(motion, G),
-            jj.generalized_force(motion, x_rate=self.push - self.brake * jnp.where(there, 1.0, 0.0)),
-        )
-
-    def events(self, motion):
-        far = motion.q.x - self.at
-        lines = {"wall": -far, "away": far, "window": jnp.abs(far) - self.width}
-        return {self.line: lines[self.line]} if self.line else {}
-
-
-def _braked(friction, at, brake, width=0.02, v=4.0, T=0.3):
-    """Its place at the time T by v^2 - 2 a s, with a = mu g, and mu g + brake in the strip."""
-    a, b = friction * G, friction * G + brake
-    v1 = jnp.sqrt(v**2 - 2 * a * at)
-    v2 = jnp.sqrt(v1**2 - 2 * b * width)
-    left = T - (v - v1) / a - (v1 - v2) / b
-    return at + width + v2 * left - a * left**2 / 2
-
-
-def test_a_strip_is_met_by_a_body_that_slips():
-    def end(numbers):
-        friction, at = numbers
-        return jj.simulate(Braked(friction=friction, at=at, brake=20.0), {"z": 0.5, "x_rate": 4.0}, ts=[0.3])[
-            "x"
-        ][-1]
-
-    numbers = jnp.array([0.3, 0.5])
-    expected = with_value(jax.jacfwd, lambda x: _braked(x[0], x[1], 20.0))(numbers)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        for found, right in zip(with_value(derivative, end)(numbers), expected, strict=True):
-            assert_allclose(found, right, atol=1e-12)
-    places = jnp.linspace(0.3, 0.7, 16)
-    lanes = jj.rollout(
-        Braked(brake=20.0),
-        {"z": 0.5, "x_rate": 4.0},
-        parameters={"at": places},
-        ts=[0.3],
-        rtol=1e-6,
-        atol=1e-6,
-    ).lanes
-    assert_allclose(lanes.q_end[:, 0], _braked(0.3, places, 20.0), atol=1e-12)
-    assert_array_equal(lanes.crossings, 2)
-
-
-@pytest.mark.parametrize("line", ["wall", "window"])
-def test_an_event_ends_a_motion_that_slips(line):
-    places, width = jnp.linspace(0.3, 1.1, 16), 1e-4
-    lanes = jj.rollout(
-        Braked(line=line, width=width), {"z": 0.5, "x_rate": 4.0}, parameters={"at": places}, t1=1.5
-    ).lanes
-    assert_allclose(lanes.q_end[:, 0], places - (width if line == "window" else 0.0), atol=1e-9)
-
-
-def test_a_body_with_friction_sets_off_from_its_event():
-    """Sliding, and pushed from rest."""
-    start = {"z": 0.5, "x_rate": jnp.array([1.0, 0.0, 0.0, -1.0])}
-    lanes = jj.rollout(
-        Braked(line="away", at=0.0), start, parameters={"push": jnp.array([0.0, 1.0, -1.0, 0.0])}, t1=0.5
-    ).lanes
-    assert lanes.event.tolist() == [-1, -1, 0, 0]
-    assert_allclose(lanes.t_end, [0.5, 0.5, 0.0, 0.0], atol=1e-9)
-    assert_allclose(lanes.q_end[1, 0], 0.125 / 1.4, atol=1e-9)
 
 
 class Sled(jj.Scene):

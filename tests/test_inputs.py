@@ -2,7 +2,6 @@
 at the knots of samples.
 """
 
-from functools import partial
 from itertools import pairwise
 
 import diffrax
@@ -71,34 +70,6 @@ def test_a_start_follows_its_inputs_smoothly_and_in_batches():
         return jj.start(OnBelt(), y=0.5, inputs={"speed": speed})["x_rate"]
 
     assert_allclose(jax.jit(jax.vmap(jax.grad(carried)))(jnp.array([1.0, 3.0])), 1.5, rtol=1e-14)
-
-
-def test_named_starts_of_simulate_rollout_and_linearize_meet_rows_that_depend_on_inputs():
-    scene, values, inputs = OnBelt(), {"y": 0.5, "x_rate": 4.5}, {"speed": 3.0}
-    alone = jj.simulate(scene, values, ts=[0.0, 0.5], inputs=inputs).raise_if_failed()
-    assert alone.moved_u == 0.0
-    assert_allclose(alone.q_end, [4.5 * 0.5, 0.5], rtol=1e-12)
-    starts = {"y": np.array([0.5, 0.2]), "x_rate": np.array([4.5, 3.6])}
-    lanes = jj.rollout(scene, starts, ts=[0.0, 0.5], inputs=inputs)
-    assert lanes.failed.size == 0
-    assert_allclose(lanes["x"][:, -1], [4.5 * 0.5, 3.6 * 0.5], rtol=1e-12)
-    assert jj.linearize(scene, values, (), inputs=inputs).A.shape[0] > 0
-    assert jj.verify(scene, values, inputs=inputs).passed
-
-
-@pytest.mark.parametrize(
-    "inputs", [{"spede": 1.0}, {"speed": "fast"}, {"speed": [1.0, 2.0]}, [1.0, 2.0], 3.0], ids=str
-)
-def test_a_start_refuses_inputs_in_the_words_of_simulate(inputs):
-    said = []
-    for f in (
-        lambda: jj.start(OnBelt(), inputs=inputs),
-        lambda: jj.simulate(OnBelt(), {}, t1=1.0, inputs=inputs),
-    ):
-        with pytest.raises(ValueError) as error:
-            f()
-        said.append(str(error.value))
-    assert said[0] == said[1]
 
 
 def test_a_scene_without_inputs_takes_none_in_a_start():
@@ -184,23 +155,6 @@ def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
     assert_allclose(balance, balance[0], atol=1e-7)
 
 
-def test_lanes_and_gradients_carry_the_work_of_inputs():
-    inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
-    options = {"ts": SPAN, "rtol": 1e-11, "atol": 1e-11, "inputs": inputs}
-    lanes = jj.rollout(PulledBead(), parameters={"mass": np.array([2.0, 3.0])}, **options)
-    work = work_by_quadrature()
-    assert_allclose(lanes.lane(0).work, work, atol=1e-8 * np.max(np.abs(work)))
-
-    def last(last_place):
-        moved = jj.Sampled(KNOTS, jnp.asarray(PLACES).at[3].set(last_place))
-        return jj.simulate(
-            PulledBead(), **options | {"inputs": {"hand": moved, "push": 0.7}, "backend": "xla"}
-        ).work[-1]
-
-    slope = (last(0.2 + 1e-4) - last(0.2 - 1e-4)) / 2e-4
-    assert_allclose(jax.grad(last)(0.2), slope, rtol=1e-6)
-
-
 def test_potentials_that_depend_on_inputs_are_found_and_named():
     assert jj.structure_of(PulledBead()).potentials_of_inputs == (1,)
     assert "potentials that depend on inputs" in jj.analysis.energy_balance(PulledBead()).changed_by
@@ -233,12 +187,6 @@ def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     assert_allclose(motion.accelerations().udot[-1], [-2.0, 2.0], atol=1e-8)
 
 
-def test_rates_of_samples_in_rows_are_their_slopes():
-    ramp = {"speed": jj.Sampled([0.0, 2.0], [0.0, 4.0])}
-    lanes = jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs=ramp).lanes
-    assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
-
-
 JUMPS = {
     "a branch": lambda t: jnp.where(t < 1.0, 0.0, 1.0),
     "steps": lambda t: 0.1 * jnp.floor(3.0 * t),
@@ -261,17 +209,6 @@ def test_an_input_of_a_row_that_jumps_is_refused(way):
             t1=2.0,
             inputs={"speed": JUMPS[way]},
         )
-
-
-def test_an_input_of_a_row_may_bend_and_be_steep():
-    steep = jj.simulate(
-        Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.tanh(1e4 * (t - 1.0))}
-    )
-    assert_allclose(steep.u_end, [0.0, 1.0], atol=1e-5)
-    motion = jj.simulate(
-        Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5}
-    )
-    assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0
 
 
 def test_an_input_of_a_row_that_has_no_derivative_is_refused():
@@ -322,47 +259,6 @@ def test_a_hammer_blow_of_a_millisecond_is_felt_in_every_loop(options):
     assert_allclose(motion.u_end[0], 0.5, rtol=1e-9)
 
 
-def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
-    random = np.random.default_rng(7)
-    for tolerance in (0.3, 1e-2, 1e-5, 1e-11):
-        at, long, high = random.uniform(0.1, 9.0), 10 ** random.uniform(-6, -1), 10 ** random.uniform(-3, 4)
-        ts, values = (
-            at + long * np.array([-1.0, -0.5, 0.0, 0.2, 0.7]),
-            high * np.array([0.0, 1.0, -1.0, 0.5, 0.0]),
-        )  # to and fro
-        inputs = {
-            "force": jj.Sampled([0.0, *ts], [0.0, *values]),
-            "push": jj.Sampled([0.0, 10.0], [-1.0, 1.0]),
-        }
-        motion = jj.simulate(Struck(), ts=[10.0], inputs=inputs, rtol=tolerance, atol=tolerance, work=False)
-        grid = np.concatenate([[0.0], ts, [10.0]])
-        impulse = np.trapezoid(np.concatenate([[0.0], values, [0.0]]), grid)  # that of the push is zero
-        assert_allclose(motion.u_end[0], impulse / 2, rtol=0, atol=1e-9 + 1e-9 * abs(impulse))
-
-
-def test_a_blow_within_thousands_of_samples_is_felt():
-    ts = np.linspace(0.0, 10.0, 10_001)
-    values = np.where((ts > 2.0135) & (ts < 2.0165), 1000.0, 0.0)
-    motion = jj.simulate(
-        Struck(), ts=[10.0], inputs={"force": jj.Sampled(ts, values)}, rtol=1e-3, atol=1e-3, work=False
-    )
-    assert_allclose(motion.u_end[0], np.trapezoid(values, ts) / 2, rtol=1e-9)
-    assert int(motion.accepted) < 100  # the straight parts have no knots
-
-
-def test_lanes_feel_blows_of_their_own_forwards_and_backwards():
-    @jax.jit
-    @partial(jax.vmap, in_axes=(0, None, None))
-    def end(at, t0, t1):
-        ts = jnp.stack([0.0 * at, at - 5e-4, at, at + 5e-4])
-        inputs = {"force": jj.Sampled(ts, jnp.array([0.0, 0.0, 2000.0, 0.0]))}
-        return jj.simulate(Struck(), {}, t0=t0, ts=[t1], inputs=inputs, work=False).q_end[0]
-
-    at = np.array([0.7, 3.0, 8.5])
-    assert_allclose(end(at, 0.0, 10.0), 0.5 * (10 - at), rtol=1e-9)
-    assert_allclose(end(at, 10.0, 0.0), 0.5 * at, rtol=1e-9)
-
-
 CLOCK, FORCE, PUSH = (
     np.linspace(0.0, 2.0, 6),
     np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]),
@@ -395,23 +291,3 @@ def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and
         return motion["x"][-1]
 
     assert_allclose(jax.jit(slope(end))(0.0), rate_of_late(FORCE, t0, t1), rtol=1e-9)
-
-
-@pytest.mark.parametrize("backend", ["auto", "xla"])
-def test_a_saved_time_at_a_knot_moves_its_own_state_alone(backend):
-    def states(ts):
-        inputs = {"force": jj.Sampled(CLOCK, FORCE)}
-        return jj.simulate(
-            Struck(mass=1.0),
-            {},
-            t0=0.0,
-            ts=ts,
-            inputs=inputs,
-            rtol=1e-5,
-            atol=1e-5,
-            work=False,
-            backend=backend,
-        )["x"]
-
-    speeds = np.concatenate([[0.0], np.cumsum(np.diff(CLOCK) * (FORCE[1:] + FORCE[:-1]) / 2)])
-    assert_allclose(jax.jit(jax.jacrev(states))(jnp.asarray(CLOCK)), np.diag(speeds), atol=1e-9)
