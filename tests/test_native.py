@@ -20,25 +20,19 @@ pytestmark = machine_code.needed
 
 
 DISC = jj.models.TiltingDisc()
-SOLVERS = {"Dopri8": None, "Taylor": jj.Taylor(8)}
-every_solver = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 LEAN = np.linspace(0.0, 1.5, 100)
 LEAN[[3, 40, 77]] = 1.7, np.nan, np.inf  # some fall, one begins beyond the event
 
 
-def ended(lean, solver):
+def ended(lean):
     """What a disc is seen to do."""
     start = {"lean": lean, "yaw_rate": 0.5 + lean, "lean_rate": 0.2, "spin_rate": -3 + 2 * lean}
-    motion = jj.simulate(
-        DISC, start, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-6, atol=1e-6, max_steps=1000, solver=solver
-    )
+    motion = jj.simulate(DISC, start, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-6, atol=1e-6, max_steps=1000)
     return motion.q, motion.u_end, motion.t_end, motion.result
 
 
-@every_solver
-def test_a_lane_does_not_depend_on_its_company(solver):
-    alone = jax.jit(lambda lean: ended(lean, solver))
-    many = jax.jit(jax.vmap(alone))
+def test_a_lane_does_not_depend_on_its_company():
+    alone, many = jax.jit(ended), jax.jit(jax.vmap(ended))
     expected = [np.asarray(x) for x in many(LEAN)]
     assert {results.SUCCESS, results.EVENT, results.BAD_START} <= set(expected[-1].tolist())
     for count in (1, 9):
@@ -53,12 +47,11 @@ def test_a_lane_does_not_depend_on_its_company(solver):
         assert_array_equal(np.reshape(found, (6, *of_all.shape[1:])), of_all[:6])
 
 
-@every_solver
-def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(solver, monkeypatch):
+def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(monkeypatch):
     """Of effort, what `conftest.py` takes for granted: tests run code made with little, users run code made
     with more.
     """
-    leans, lanes = jnp.tile(LEAN, 13), jax.jit(jax.vmap(lambda lean: ended(lean, solver)))
+    leans, lanes = jnp.tile(LEAN, 13), jax.jit(jax.vmap(ended))
     expected = lanes(leans)
     for effort, threads in ((0, 1), (2, 5)):
         monkeypatch.setattr(host, "EFFORT", effort)

@@ -10,7 +10,6 @@ import machine_code
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from test_native_second import X, _seen
 
 import jourdain_jax as jj
 from jourdain_jax.program import emit
@@ -18,16 +17,6 @@ from jourdain_jax.program.derivative import cotangents
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed
-
-
-def test_cotangents_of_lanes_do_not_depend_on_their_company():
-    """Those of the closed form: see `test_native_second`."""
-    lanes = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 7)))
-    every = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(_seen(x, True)))))
-    expected = np.asarray(every(lanes))
-    for count in (3, 9):  # fewer than a register holds, and one more than the widest
-        order = np.random.default_rng(count).permutation(11)[:count]
-        assert_allclose(every(lanes[order]), expected[order], rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -77,7 +66,7 @@ def _counted(alignment, size):
 _taken = SIGNATURE(("aligned_alloc", ctypes.CDLL(None)))
 
 
-def _largest_record(memory, lanes):
+def _largest_record(memory):
     """Gradients of motions of some hundred steps, and how many bytes their largest record takes."""
     model = jj.build(jj.models.TiltingDisc(), backend="native", memory=memory)
 
@@ -88,21 +77,19 @@ def _largest_record(memory, lanes):
 
     RECORDS.clear()
     each = jax.grad(seen, (0, 1))
-    x = np.linspace([0.1, 0.3], [0.4, 0.6], lanes).T
-    found = jax.jit(jax.vmap(each))(*x) if lanes > 1 else jax.jit(each)(*x[:, 0])
+    found = jax.jit(jax.vmap(each))(*np.linspace([0.1, 0.3], [0.4, 0.6], 11).T)
     return np.array(found), max(RECORDS)
 
 
-@pytest.mark.parametrize("lanes", [1, 11])
-def test_records_of_reverse_mode_keep_to_the_memory_of_the_model(monkeypatch, lanes):
+def test_records_of_reverse_mode_keep_to_the_memory_of_the_model(monkeypatch):
     from llvmlite import binding as llvm
 
     monkeypatch.setenv("JOURDAIN_JAX_THREADS", "1")
     llvm.add_symbol("aligned_alloc", ctypes.cast(_counted, ctypes.c_void_p).value)
     try:
-        whole, needed = _largest_record(10**9 + lanes, lanes)
+        whole, needed = _largest_record(10**9 + 11)
         for memory in (needed, needed // 20):  # half of it is there too where a record has grown
-            found, most = _largest_record(memory, lanes)
+            found, most = _largest_record(memory)
             assert 0.2 * memory < 1.5 * most <= memory
             assert_array_equal(found, whole)
     finally:

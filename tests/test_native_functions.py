@@ -95,22 +95,6 @@ def test_an_event_may_depend_on_a_function_of_time(derivative):
     assert_allclose(slope, -by_a / by_t, rtol=0, atol=1e-7)
 
 
-def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_closes_over_nothing():
-    def ends(amplitudes):
-        inputs = {
-            "force": lambda t: amplitudes @ jnp.stack([jnp.sin(1.3 * t), jnp.sin(0.5 * t)]),
-            "aside": lambda t: 2.0 * t,
-        }
-        return jj.simulate(Pushed(), {"x": 0.3}, ts=TS, inputs=inputs, **TIGHT)
-
-    found, amplitudes = ends(jnp.array([0.8, 0.1])), jnp.array([0.8, 0.1])
-    assert found.reduction.endswith("machine code")
-    assert_allclose(found["y"], TS**3 / 3, rtol=0, atol=1e-9)
-    slopes = jax.jit(jax.jacrev(lambda a: ends(a)["x"]))(amplitudes)
-    for column, b in zip(slopes.T, (1.3, 0.5), strict=True):
-        assert_allclose(column, position(TS, 0.0, 4.0, 1.0, b), rtol=0, atol=1e-8)
-
-
 def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
     class Fresh(Pushed):
         """A scene of which nothing is known yet."""

@@ -4,7 +4,6 @@ import gc
 import os
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import jax
@@ -89,25 +88,6 @@ def test_ten_thousand_calls_leave_nothing_behind(kind):
         gc.collect()
         found.append(_resident())
     assert min(np.diff(found)) < 80_000  # 40 bytes for each call; now and then, allocators ask for more
-
-
-def test_threads_of_python_may_call_at_once():
-    disc = jj.models.TiltingDisc()
-    run = jax.jit(jax.vmap(lambda lean: jj.simulate(disc, {"lean": lean}, **OPTIONS).q_end))
-    leans = [jnp.linspace(0.1 * k, 0.1 * k + 0.3, 200) for k in range(4)]
-    expected, found = [np.asarray(run(x)) for x in leans], {}
-
-    def work(k):
-        for _ in range(20):
-            found[k] = [np.asarray(run(x)) for x in leans]
-
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 6
-    assert all(np.array_equal(a, b) for each in found.values() for a, b in zip(each, expected, strict=True))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no process is forked here")

@@ -79,18 +79,6 @@ def test_states_on_the_rows_stay_and_those_beside_them_move(trailers):
     assert_allclose(np.trace(slopes), 2, atol=1e-13)
 
 
-def test_lanes_that_are_no_numbers_and_those_that_run_away():
-    q, u = _near_rows(BICYCLE, 5)
-    q = q.at[1].set(jnp.nan).at[2, 0].set(jnp.inf).at[4, 3].set(1e3)
-    ours, theirs = _by_both(BICYCLE, q, u.at[3].set(jnp.nan))
-    for found in (ours, theirs):
-        assert_array_equal(
-            np.isfinite(found.q).all(axis=1) & np.isfinite(found.u).all(axis=1),
-            [True, False, False, False, True],
-        )
-    _same([ours.q[0], ours.u[0]], [theirs.q[0], theirs.u[0]])
-
-
 @pytest.mark.parametrize(
     ("scene", "tolerance"),
     [

@@ -136,14 +136,6 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
     assert_allclose(*errors, rtol=1e-6)
 
 
-@pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
-def test_a_repeat_without_samples_has_not_converged(sigma):
-    found = jj.fit_batch(Bead(), run({"x": np.stack([LINE, np.full(6, np.nan)])}, sigma))
-    assert found.converged.tolist() == [True, False]
-    one = jj.fit(Bead(), run({"x": LINE}, sigma))
-    assert_allclose(found.standard_errors[0], one.standard_errors, rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"]
 )

@@ -15,17 +15,13 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import machine_code
-import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from refusals import refused
 
 import jourdain_jax as jj
 from jourdain_jax.calculus import files as whole_files
-from jourdain_jax.integrate.loop import value_kernels
 from jourdain_jax.kernels import ffi, host
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.program.graph import Graph
 from jourdain_jax.studies import memory, records, workers
 from jourdain_jax.studies.store import Store
 
@@ -105,22 +101,6 @@ def test_processors_of_arm_have_vectors_and_fused_products_also_where_llvm_says_
     features = host.features.__wrapped__()
     monkeypatch.setattr(host, "features", lambda: features)
     assert (host.lanes(), host.fuses(), host.registers()) == (2, True, 28)
-
-
-@needs_machine_code
-def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(monkeypatch):
-    monkeypatch.setattr(host, "lanes", lambda: 2)
-    monkeypatch.setattr(host, "threads", lambda: 3)
-    asked, write = [], value_kernels.write_rows
-    counted = lambda *given: asked.append(given[0].threads) or write(*given)
-    monkeypatch.setattr(value_kernels, "write_rows", counted)
-    graph = Graph()
-    x = graph.input("x", True)
-    sine = value_kernels.nodes_called(graph, [graph.call("sin", x)], [x])
-    angles = np.linspace(0.0, 3.0, 301)[:, None]  # enough for three threads
-    assert_allclose(jax.vmap(sine)(jnp.asarray(angles)), np.sin(angles), rtol=1e-15, atol=1e-16)
-    assert_allclose(sine(jnp.asarray(angles[7])), np.sin(angles[7]), rtol=1e-15)
-    assert asked == [3, 1]
 
 
 def test_threads_are_as_many_as_the_machine_has_cores_where_a_process_cannot_choose_them(monkeypatch):

@@ -182,16 +182,6 @@ def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_
             np.testing.assert_allclose(value, expected, rtol=ROUND_OFF, atol=1e-13)
 
 
-def test_samples_in_single_precision_are_those_in_double():
-    times, pushes = [0.0, 1.0, 2.0], [0.0, 1.0, -2.0]
-    single = jj.Sampled(np.array(times, np.float32), jnp.array(pushes, jnp.float32))
-    ends = [
-        jj.simulate(Slider(), t1=3.0, inputs={"push": samples}).q_end
-        for samples in (single, jj.Sampled(times, pushes))
-    ]
-    assert jnp.all(ends[0] == ends[1])
-
-
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
 def test_a_state_in_single_precision_moves_in_double(backend):
     scene, options = Slider(), {"t1": 3.0, "backend": backend}
@@ -221,15 +211,3 @@ def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_nu
     assert_allclose(float(value), 0.5 * np.cosh(0.7 * float(given)), rtol=1e-10)  # r'' = rate^2 r
     assert slope.dtype == precision
     assert_allclose(float(slope), 0.35 * np.sinh(0.7 * float(given)), rtol=float(jnp.finfo(precision).eps))
-
-
-@pytest.mark.parametrize("precision", [jnp.float32, jnp.bfloat16])
-def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_double(precision):
-    def end(rate):
-        return jj.simulate(Slider(), {"x": 0.0}, ts=[1.0], inputs={"push": lambda t: rate * t}).q_end[0]
-
-    given = precision(1.3)
-    assert_allclose(
-        float(end(given)), float(given) / 24, rtol=1e-6
-    )  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
-    assert_allclose(float(jax.grad(end)(given)), 1 / 24, rtol=float(jnp.finfo(precision).eps) + 1e-6)

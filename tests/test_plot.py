@@ -96,20 +96,6 @@ def test_of_a_rollout_bands_hold_the_parts_that_are_asked_for(lanes):
     assert not overlap(figure, figure.legends[0], axes[0].title, *axes)
 
 
-def test_rollouts_and_motions_share_a_figure_and_the_axes_of_a_user(lanes, motions, tmp_path):
-    own, panels = plt.subplots(1, 2)
-    figure, axes = jj.plot([lanes, motions[0]], "x", "y", labels=["many", "one"], bands=(), axes=panels)
-    assert figure is own
-    assert list(axes) == list(panels)
-    assert [line.get_label() for line in panels[0].lines] == ["many, median", "one"]
-    assert texts(panels[0].get_legend()) == ["many, median", "one"]
-    with plt.rc_context({"svg.fonttype": "none"}):  # text as text
-        jj.plot(motions, "x", path=tmp_path / "two.svg")
-    written = (tmp_path / "two.svg").read_text()
-    assert "motion 0" in written
-    assert "motion 1" in written
-
-
 def test_labels_have_the_units_that_bodies_show_and_panels_have_letters():
     axle = jj.simulate(jj.models.model("two-wheel-axle-coordinates"), t1=0.1, ts=TS[:2] / 10)
     _, axes = jj.plot(axle, "x1", "psi1_rate", "phi", "energy")

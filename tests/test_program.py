@@ -13,9 +13,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.program.derivative import derivatives, directional_derivative
+from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.emit import run, sine_and_cosine
-from jourdain_jax.program.evaluate import Probes, more_operations
+from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms, TooLarge
@@ -175,17 +175,6 @@ def test_sine_and_cosine_are_right_to_the_last_digits():
     assert np.isnan(sine_and_cosine(jnp.inf)[0])
 
 
-def test_sine_and_cosine_differentiate_to_second_order_in_both_modes():
-    for f, first, second in (
-        (lambda x: sine_and_cosine(x)[0], np.cos, lambda x: -np.sin(x)),
-        (lambda x: sine_and_cosine(x)[1], lambda x: -np.sin(x), lambda x: -np.cos(x)),
-    ):
-        for x in (0.0, 1.3, -40.0):
-            assert_allclose(jax.grad(f)(x), first(x), atol=3e-16)
-            assert_allclose(jax.jacfwd(jax.grad(f))(x), second(x), atol=3e-16)
-            assert_allclose(jax.grad(jax.grad(f))(x), second(x), atol=3e-16)
-
-
 def _every_function(graph):
     x, y, a = *_x(graph, "x", "y"), graph.input("a", False)
     own = {"neg", "acosh", "sign", "not", "is_finite", "select"}  # no functions, or elsewhere
@@ -238,32 +227,6 @@ def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path):
         pytest.skip("no C compiler")
     out = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
     assert_allclose([float(v) for v in out.split()], expected, rtol=1e-14)
-
-
-def test_operations_of_two_nodes_are_compared_by_what_they_do_not_share():
-    generator = np.random.default_rng(1)
-    for _ in range(300):
-        graph = Graph()
-        nodes = [graph.input(f"x{i}", i > 0) for i in range(4)]
-        for _ in range(generator.integers(2, 40)):
-            op, (a, b) = (
-                str(generator.choice(["add", "sub", "mul", "div", "sin", "cos", "neg"])),
-                generator.choice(nodes, 2).tolist(),
-            )
-            nodes.append(graph.call(op, a) if op in ("sin", "cos", "neg") else graph.call(op, a, b))
-        a, b = generator.choice(nodes, 2).tolist()
-        assert more_operations(graph, a, b) == graph.operations([a]) - graph.operations([b])
-
-
-def test_derivatives_along_many_directions_are_those_along_each():
-    graph = Graph()
-    x, y, z = (graph.input(name, True) for name in "xyz")
-    inner = graph.mul(x, graph.call("sin", y))
-    outputs = [graph.add(inner, z), graph.div(inner, graph.add(graph.one, graph.mul(z, z))), graph.const(2.0)]
-    directions = {0: {x: graph.one, inner: y}, 1: {z: x, inner: graph.zero}, 2: {y: graph.one, inner: z}}
-    together = directional_derivative(graph, outputs, directions)
-    for k, direction in directions.items():
-        assert [row.get(k, graph.zero) for row in together] == derivatives(graph, outputs, direction)
 
 
 def test_a_computation_of_too_many_scalars_is_refused_before_it_is_built(monkeypatch):

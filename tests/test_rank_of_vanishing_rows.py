@@ -43,14 +43,6 @@ def test_rank_is_lost_where_a_row_is_round_off(name, unit):
 
 
 @pytest.mark.parametrize("name", SINGULAR)
-def test_the_smallest_singular_value_goes_to_zero_with_the_distance(name):
-    distances = np.array([1e-1, 1e-3, 1e-5, 1e-7, 1e-9])
-    values = np.array([float(_near(name, distance)[2].smallest_singular_value) for distance in distances])
-    assert np.all(np.diff(values) < 0)
-    assert_allclose(values[1:] / distances[1:], values[1] / distances[1], rtol=1e-2)
-
-
-@pytest.mark.parametrize("name", SINGULAR)
 def test_the_conditioning_does_not_depend_on_the_unit_of_a_row_and_names_the_configuration(name):
     values = [float(_near(name, 0.2, unit)[2].smallest_singular_value) for unit in UNITS]
     assert_allclose(values, values[0], rtol=1e-6)
@@ -148,12 +140,6 @@ def test_probed_configurations_are_on_the_rows_and_in_the_domain(name):
     assert_on_rows_and_in_domain(scene, found.times, found.coordinates)
 
 
-@pytest.mark.parametrize("name", ["Bennett", "parallelogram", "windows"])
-def test_sampled_states_are_on_the_rows_and_in_the_domain(name):
-    scene, _ = LINKAGES[name]
-    assert_on_rows_and_in_domain(scene, *jj.sample_states(scene, 5, seed=3)[:2])
-
-
 def _swinging():
     """Two windows of rods with all speeds in the state, which pass two positions where one freedom becomes
     three.
@@ -168,15 +154,14 @@ def _start(rate):
     }
 
 
-@pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
-def test_losses_of_rank_are_passed_at_every_tolerance(tolerance):
+def test_losses_of_rank_are_passed_at_a_tight_tolerance():
     """Saved times lie at all distances from them; `3 a'' = 3.5 g sin a` for the angle of the cranks from
     upright.
     """
     ts, rates = np.linspace(0.0, 2.0, 101), jnp.append(jnp.linspace(0.6, 1.9, 15), 1.0)
-    found = jj.rollout(_swinging(), _start(rates), ts=ts, rtol=tolerance, atol=tolerance)
+    found = jj.rollout(_swinging(), _start(rates), ts=ts, rtol=1e-12, atol=1e-12)
     assert np.all(found.result == 0)
-    assert_allclose(found["x0"][-1], np.sin(linkage_angle(ts)), atol=1e-10 + 3 * tolerance)
+    assert_allclose(found["x0"][-1], np.sin(linkage_angle(ts)), atol=1.03e-10)
 
 
 def test_derivatives_past_losses_of_rank_are_differences():

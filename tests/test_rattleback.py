@@ -44,18 +44,6 @@ def test_rates_are_those_of_the_equations_by_hand():
         assert relative_error(rates(q, u), expected.astype(float)) <= ROUND_OFF
 
 
-def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
-    squares = np.array([oracle.RUN[axis] ** 2 for axis in "abc"])
-    for down in np.random.default_rng(3).normal(size=(10, 3)):
-        down /= np.linalg.norm(down)
-        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array(
-            [0.0, 0.0, oracle.RUN["h"]]
-        )  # from the ellipsoid's centre
-        normal = point / squares
-        assert abs(point @ normal - 1) <= ROUND_OFF
-        assert relative_error(normal / np.linalg.norm(normal), down) <= ROUND_OFF
-
-
 @pytest.mark.parametrize("time", oracle.TABLE)
 def test_all_printed_digits_come_out(motion, time):
     assert np.all(np.abs(_saved(motion, time) - oracle.TABLE[time]) <= oracle.DIGITS[time])

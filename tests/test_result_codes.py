@@ -48,17 +48,10 @@ def driven(off, speed=1.0, **way):
     return jj.simulate(TwoBelts(), {"y_rate": speed}, ts=[0.5, 1.0], inputs=belts(off), **way)
 
 
-def test_rows_that_contradict_each_other_later_are_told_and_derivatives_are_as_without_the_check():
-    def squared(speed, off):
-        motion = driven(off, speed)
-        return motion.q_end[1] ** 2, motion.result
-
-    alone, offs = jax.jit(driven), np.array([0.0, 0.0, 0.5])
-    slopes, codes = jax.jit(jax.vmap(jax.jacfwd(squared, has_aux=True)))(np.array([1.0, 2.0, 1.0]), offs)
-    assert codes.tolist() == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
-    assert [alone(off).result for off in offs] == codes.tolist()
-    assert_allclose(alone(0.0).q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
-    assert_allclose(slopes[:2], [2.0, 4.0], rtol=1e-7)
+def test_rows_that_contradict_each_other_later_are_told():
+    right, wrong = map(jax.jit(driven), (0.0, 0.5))
+    assert (right.result, wrong.result) == (results.SUCCESS, results.CONTRADICTORY_ROWS)
+    assert_allclose(right.q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
 
 
 def test_nonlinear_rows_are_told_as_well():
@@ -130,13 +123,6 @@ def passing(v, **way):
 @pytest.mark.parametrize("way", WAYS)
 def test_a_feature_that_steps_pass_over_is_told_by_the_energy(way):
     assert jax.jit(jax.vmap(lambda v: passing(v, **way)))(SPEEDS).tolist() == CODES
-
-
-def test_the_energy_tells_it_also_of_motions_alone_and_in_a_rollout():
-    assert [int(passing(v)) for v in SPEEDS] == CODES
-    assert (
-        jj.rollout(Step(), {"x_rate": SPEEDS, "y_rate": 1.0 + 0 * SPEEDS}, ts=[1.5]).result.tolist() == CODES
-    )
 
 
 def test_an_edge_that_steps_can_follow_is_passed():
@@ -237,9 +223,8 @@ def _codes(kind, backend, solver=None):
     return inward, away, lost
 
 
-CASES = [(kind, backend, None) for kind in RATES for backend in ("native", "xla")] + [
-    (kind, "dense", None) for kind in ("shifted", "regular")
-]
+CASES = [(kind, "native", None) for kind in RATES]
+CASES += [(kind, backend, None) for kind in ("shifted", "regular") for backend in ("xla", "dense")]
 CASES += [(kind, "native", jj.Taylor()) for kind in ("sine", "regular")]
 
 

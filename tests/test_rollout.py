@@ -8,7 +8,6 @@ import pytest
 import result_codes as results
 from numpy.testing import assert_allclose
 from refusals import refused
-from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh
@@ -58,16 +57,6 @@ def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
     assert "<img" not in lanes._repr_html_()
 
 
-def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
-    masses = {"mass": np.array([1.0, -1.0, np.nan, 0.0])}
-    lanes = jj.rollout(ChaplyginSleigh(), parameters=masses, **OPTIONS)
-    assert lanes.result.tolist() == [results.SUCCESS, *[results.BAD_PARAMETER] * 3]
-    assert "wrong sign (`mass`): lanes 1, 2, 3" in str(lanes)
-    assert lanes.lane(1).message.endswith("(`mass`); check where it was computed")
-    assert np.isnan(lanes["x"][1:]).all()
-    assert np.all(lanes.lanes.t_end[1:] == 0.0)
-
-
 def test_another_tolerance_longest_step_or_end_is_no_other_program(compilations):
     starts = {"x_rate": 0.5, "heading_rate": np.linspace(0.4, 0.8, 3)}
 
@@ -108,15 +97,3 @@ def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",))
     on_devices = jax.shard_map(jax.vmap(end), mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
     assert_allclose(jax.jit(on_devices)(speeds), [end(speed) for speed in speeds], rtol=1e-12, atol=1e-15)
-
-
-def test_a_number_in_a_plain_field_is_a_leaf_of_every_lane():
-    class Oscillator(OnLine):
-        stiffness: float = 2.0
-
-        def loads(self, motion):
-            return jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x)
-
-    lanes = jj.rollout(Oscillator(), {"x": np.array([1.0, -2.0])}, **OPTIONS)
-    assert_allclose(lanes["x"], np.outer([1.0, -2.0], np.cos(np.sqrt(2.0) * OPTIONS["ts"])), atol=1e-8)
-    assert lanes.lane(1).scene.stiffness == 2.0

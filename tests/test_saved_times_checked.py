@@ -64,19 +64,6 @@ def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_
     assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
 
 
-def test_lanes_with_times_of_their_own_are_judged_one_by_one():
-    begun = np.array([0.0, 0.5, 0.6, 1.2])
-    states = jax.vmap(lambda x, t: jj.start(SPRING, x=x, t0=t))(jnp.ones(4), jnp.asarray(begun))
-    lanes = jj.rollout(SPRING, states, ts=[0.5, 1.0])
-    assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
-    assert np.isnan(lanes.lanes.q[2:]).all()
-    assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
-    assert "saved times lie outside the span or are not in order" in str(lanes)
-    assert "lanes 2, 3" in str(lanes)
-    with pytest.raises(jj.SimulationError, match="saved times lie outside the span"):
-        lanes.lane(2).raise_if_failed()
-
-
 def test_even_times_of_any_span_go_together():
     generator = np.random.default_rng(0)
     ends = generator.normal(size=(200, 2)) * 10.0 ** generator.uniform(-3, 9, size=(200, 1))

@@ -126,16 +126,6 @@ def test_simulate_traces_once_for_different_numbers():
         run(scene, jj.start(scene, z_rate=mass))
 
 
-def test_a_scene_and_a_start_in_float32_move_in_double_precision_where_it_is_switched_on(recwarn):
-    scene, state = (
-        jax.tree.map(lambda x: x.astype(jnp.float32), x)
-        for x in (Falling(), jj.start(Falling(), z=4.0, z_rate=1.0))
-    )
-    motion = jj.simulate(scene, state, t1=0.1, rtol=1e-8)
-    assert (motion.q.dtype, recwarn.list) == (jnp.float64, [])
-    assert motion["z"][-1] == pytest.approx(4.0 + 0.1 - 0.5 * float(scene.gravity) * 0.01, abs=1e-12)
-
-
 class Trolley(jj.Scene):
     """A particle on a guide, stated twice, that a force of 1 N pulls; a wheel of radius 1 m rolls along."""
 

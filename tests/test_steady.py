@@ -133,6 +133,3 @@ def test_a_search_of_one_step_says_that_it_did_not_arrive():
     found = steady(Sprung(), {"x": 10.0}, options=jj.Options(max_steps=1))
     assert not found.converged
     assert found.residual > 1e-4
-
-
-# Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.

@@ -100,13 +100,6 @@ def test_a_quantile_lies_within_its_stated_limits(whole, level):
         assert low <= own[max(1, int(np.ceil(level * own.size))) - 1] <= high
 
 
-def test_the_bars_of_a_yes_and_a_no_are_equally_wide(whole):
-    counts, edges = whole.histogram("fell")
-    assert counts[0] + counts[-1] == counts.sum()
-    assert counts[-1] == np.sum(whole.to_xarray()["fell"].values == 1.0) > 0
-    assert_allclose(np.diff(edges), edges[1] - edges[0])
-
-
 def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     assert whole.failed.tolist() == [BAD]
     assert whole.counts["bad_parameter"] == 1
@@ -143,11 +136,6 @@ def test_netcdf_holds_the_same(whole, tmp_path):
         for name in whole.to_xarray().variables:
             assert_array_equal(arrays[name].values, whole.to_xarray()[name].values)
         assert arrays["final lean"].attrs["units"] == "rad"
-
-
-def test_chunks_do_not_change_a_bit(whole, tmp_path):
-    assert whole.store.chunk == 32
-    assert_same(discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, chunk=160, **ASKED), whole)
 
 
 def test_statistics_need_no_lanes(whole, tmp_path):

@@ -86,29 +86,6 @@ def test_recurrences_of_functions_give_their_taylor_series():
         assert_allclose(series, true, rtol=1e-13, atol=close, err_msg=op)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_series_of_random_programs_are_those_of_mpmath(seed):
-    random, graph = np.random.default_rng(seed), Graph()
-
-    def put(op, *of):
-        nodes, functions = zip(*of, strict=True)
-        return graph.call(op, *nodes), lambda s: in_mpmath(op)(*(f(s) for f in functions))
-
-    s, p = graph.input("s", True), graph.input("p", False)
-    nodes = [(s, lambda s: s), (p, lambda s: mpmath.mpf(1.5)), (graph.const(0.3), lambda s: mpmath.mpf(0.3))]
-    two = (graph.const(2.0), lambda s: mpmath.mpf(2))
-    for _ in range(14):
-        a, b = (nodes[i] for i in random.integers(len(nodes), size=2))
-        op = str(random.choice([*TWO, "sin", "cos", "tanh", "atan", "sqrt", "logistic"]))
-        if op in ("div", "sqrt"):  # of what is not small
-            b = put("add", two, put("mul", b, b))
-        nodes.append(put(op, a, b) if op in TWO else put(op, b))
-    found = coefficients(graph, s, [n for n, _ in nodes[3:]], 0.6, {p: 1.5})
-    for i, (_, f) in enumerate(nodes[3:]):
-        true = expected(f, 0.6)
-        assert_allclose(found[:, i], true, rtol=1e-11, atol=1e-12 * np.max(np.abs(true)))
-
-
 # Motions. ---------------------------------------------------------------------------------------------------
 
 DISC, SLEIGH = jj.models.TiltingDisc(), jj.models.ChaplyginSleigh()
