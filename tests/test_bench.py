@@ -11,24 +11,21 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
 from atlas_cases.cases import CASES
-from atlas_cases.mechanisms import BY_CASE, USUAL
-from atlas_cases.methods import GROUPS, METHODS
-from atlas_cases.outcomes import FLAGGED, NAN, judged
+from atlas_cases.methods import METHODS
+from atlas_cases.outcomes import FLAGGED
 from hunting import judging, oscillators
 from hunting.families import FAMILIES, family
 from hunting.family import Ask, Family, Truth
-from hunting.record import BY_CODE, BY_WARNING, LOST, REFUSED, RIGHT, UNDECIDED, WRONG, refusal
+from hunting.record import BY_CODE, RIGHT, UNDECIDED, WRONG
 from hunting.reference import integrate
-from hunting.table import as_markdown, figures, losses
+from hunting.table import losses
 from numpy.testing import assert_allclose
 from solved_states import over_states
-from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
+from tolerances import ROUND_OFF
 
 import jourdain_jax as jj
 from jourdain_jax.equations import coordinate_rates
@@ -81,12 +78,6 @@ def test_the_reference_of_an_oscillator_is_its_closed_form():
     assert_allclose(x, np.cos(w * ts), atol=1e-9)
 
 
-def test_a_motion_that_ends_in_finite_time_has_no_reference_and_does_not_spoil_its_neighbours():
-    y = integrate(lambda _, x, z: (x**2, -z), (np.array([[0.1], [2.0]]), 1.0), np.array([[0.4, 1.0]] * 2))
-    assert np.all(np.isnan(y[:, 1, -1]))
-    assert_allclose(y[:, 0].T, [[0.1 / 0.96, np.exp(-0.4)], [0.1 / 0.9, np.exp(-1.0)]], rtol=1e-10)
-
-
 def _motion(x, code=results.SUCCESS, warned=()):
     end = np.array([x])
     return SimpleNamespace(
@@ -133,38 +124,6 @@ def test_a_motion_is_right_or_flagged_or_wrong(motion, truth, outcome):
     )
 
 
-def test_an_error_of_the_engine_refuses_and_a_raw_one_crashes():
-    def of(call):
-        try:
-            call()
-        except Exception as error:
-            return refusal(error)[0]
-
-    assert of(lambda: jj.simulate(oscillators.Oscillator(), {"y": 1.0})) == REFUSED
-    assert of(lambda: np.zeros(2) + np.zeros(3)) in LOST
-
-
-def test_the_table_and_the_figures_count_what_was_found():
-    made = [
-        {
-            "family": "room",
-            "seed": k,
-            "dtype": "float64",
-            "asked": "",
-            "outcome": o,
-            "error": None,
-            "said": "",
-            "seconds": 1.0,
-        }
-        for k, o in enumerate((RIGHT, WRONG, BY_WARNING))
-    ]
-    table = list(as_markdown(made))
-    assert any(line.startswith("| room | several events") and "| 3 | 1 |" in line for line in table)
-    lost = next(f for f in figures(made, 3.0) if f["model"] == "room")
-    assert (lost["value"], lost["required"], lost["met"]) == (1, 0, False)
-    assert "--only room --seed 1" in next(iter(losses(made)))
-
-
 # The atlas of hard cases: the engine as it comes is right in those that name it, and the script writes what
 # it documents.
 
@@ -205,32 +164,10 @@ def test_every_row_of_the_table_of_hard_cases_is_there_once():
     assert len({method.name for method in METHODS}) == len(METHODS)
 
 
-def test_every_method_has_a_reason_to_fail_in_one_line():
-    for method in METHODS:
-        assert USUAL[method.name], method.name
-        assert "\n" not in USUAL[method.name]
-
-
-def test_reasons_are_given_for_cases_and_methods_that_exist():
-    numbers = {name.split()[0] for name in BY_NAME}
-    for name, reasons in BY_CASE.items():
-        assert name in BY_NAME or name in numbers
-        assert set(reasons) <= {*USUAL, *GROUPS}
-
-
-def test_outcomes_are_decided_by_the_error_and_by_what_a_method_says():
-    assert judged(1e-12, 1e-10).outcome == RIGHT
-    assert judged(1e-9, 1e-10).outcome == WRONG
-    assert judged(float("nan"), 1e-10).outcome == NAN
-    assert judged(float("nan"), 1e-10, "rank 1 of 2 rows").outcome == FLAGGED
-    assert judged(0.0, 1e-10, "out of steps", stalled=True).outcome == "stalled"
-
-
 # The baselines of `bench/` give the accelerations of the engine, and their operations are counted right.
 
 
 hand_derived = pytest.importorskip("baselines.hand_derived", reason="the scripts of `bench/` are not here")
-from baselines import count, dense, disc_run, flat, heyoka_disc, heyoka_lowered  # noqa: E402
 
 STATES = 20
 
@@ -289,78 +226,6 @@ def test_equations_derived_by_hand_give_the_rates_of_the_engine(name):
     found = known.rates(_parameters(scene), t, _columns(q), _columns(u[:, independent]))
     _assert_equal(np.stack(found[0], 1), qdot)
     _assert_equal(np.stack(found[1], 1), udot[:, independent], among=udot)
-
-
-@pytest.mark.parametrize(
-    ("name", "rates"), [("tilting-disc", dense.disc_rates), ("whipple-bicycle", dense.bicycle_rates)]
-)
-def test_dense_equations_give_the_rates_of_the_engine(name, rates):
-    scene, (t, q, u), qdot, udot = _solved(name)
-    found = jax.jit(jax.vmap(rates, in_axes=(None, 0, 0)))(
-        _parameters(scene), t, jnp.concatenate([q, u], axis=1)
-    )
-    _assert_equal(found, np.concatenate([qdot, udot], axis=1))
-
-
-def test_the_dense_scripts_have_the_parameters_of_the_models():
-    for name, parameters in (
-        ("tilting-disc", dense.DISC_PARAMETERS),
-        ("whipple-bicycle", dense.BICYCLE_PARAMETERS),
-    ):
-        assert parameters == _parameters(jj.models.MODELS[name]())
-
-
-def test_dense_and_flat_equations_run_the_disc_to_the_same_end():
-    starts, end = disc_run.starts(3), 0.5
-    run = jax.jit(
-        lambda rates, y: dense.integrate(rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-11),
-        static_argnums=0,
-    )
-    by_hand = run(flat.disc_rates, starts)
-    assert (
-        relative_error(run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand)
-        < CLOSED_FORM
-    )
-
-
-@pytest.mark.parametrize("width", [1, 4])
-def test_heyoka_runs_the_disc_to_the_same_end(width):
-    starts = disc_run.starts(4)
-    if heyoka_lowered.heyoka is None:
-        with pytest.raises(ImportError, match="pip install heyoka"):
-            heyoka_disc.system()
-        pytest.skip(heyoka_lowered.MISSING)
-    run = heyoka_lowered.final_states(heyoka_disc.system(), disc_run.END, 1e-13, width)
-    assert disc_run.error(run(starts), disc_run.reference(starts)) < CLOSED_FORM
-
-
-def test_operations_are_counted_after_common_subexpressions():
-    def rates(p, t, q, v, xp):
-        gain = xp.sin(p["a"]) * p["b"] + 1  # of parameters alone: free
-        shared = gain * (q[0] * v[0])  # 2
-        xp.sqrt(q[0])  # needed by nothing
-        return (shared + xp.cos(t), -(gain * (v[0] * q[0]))), (
-            q[0] * q[0] / p["b"],
-            xp.zeros_like(t),
-        )  # 2; 1; 1 + 1
-
-    counted = count.count_operations(rates, ("a", "b"), 1, 1)
-    assert counted == {"mul": 3, "add": 1, "cos": 1, "neg": 1, "div": 1}
-
-
-@pytest.mark.parametrize(
-    ("name", "operations"),
-    [
-        ("two-wheel-axle-coordinates", 11),
-        ("skate", 9),
-        ("chaplygin-sleigh", 13),
-        ("vertical-disc", 5),
-        ("tilting-disc", 21),
-        ("ball-on-turntable", 34),
-    ],
-)
-def test_hand_derived_equations_need_few_operations(name, operations):
-    assert hand_derived.operations(name) == operations
 
 
 # Every script of `bench` that has `--quick` runs to its end and writes what it found.

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
-import equinox as eqx
 import gpu_twin
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 from ends_of_models import end_of_model
 from numpy.testing import assert_array_equal
-from small_scenes import OnPlane
 from test_modes import NUMBERS, seen
 
 import jourdain_jax as jj
@@ -145,59 +143,6 @@ def test_lanes_come_last_and_what_they_share_is_given_once():
         r" tensor<1xf64>",
         back[2],
     )
-
-
-def test_parameters_are_given_once_to_projections_of_a_state_and_to_all_derivatives():
-    bicycle = jj.models.MODELS["whipple-bicycle"]()
-    state = jj.start(bicycle, **bicycle.example)
-
-    def end(mass, time, speed):
-        start = eqx.tree_at(lambda state: state.u, state, state.u.at[0].set(speed))
-        return jnp.sum(jj.simulate(bicycle.replace(mB=mass), start, ts=[time]).u_end)
-
-    with gpu_twin.in_place_of_a_gpu():
-        program = jax.jit(jax.vmap(jax.grad(end, (0, 1)), (None, None, 0)))
-        text = program.lower(bicycle.mB, 0.1, np.linspace(0.1, 0.2, 7)).as_text()
-    calls = re.findall(r"@jourdain_jax_\w+\(.*} : \((tensor<7x.*)\) -> \(.*\)\n", text)
-    given = {tuple(map(int, re.findall(r"\d+(?=x)", call))) for call in calls}
-    # time, 8 coordinates, 8 speeds and 2 inputs of a lane; 26 of the bicycle's parameters, and sizes: the
-    # projections, values of constraints, a product with a tangent, and products with cotangents
-    assert {(7, 9, 35), (7, 19, 39), (7, 9, 26), (7, 19, 26), (7, 14, 26), (7, 51, 26), (7, 59, 26)} <= given
-    # speeds of three states and their derivative: 29 fixed values; the derivative of 110 fixed values
-    assert {(7, 3, 14, 29), (7, 3, 22, 29), (7, 110, 26)} <= given
-    # rates at the saved time and at the end: 12 numbers of a lane's state and its time; what all share
-    assert {(7, 1, 13, 112), (7, 13, 112)} <= given
-    small = [call for call in given if len(call) < 5]
-    assert not [call for call in small if call[-1] == 1]  # none without shared numbers
-
-
-class Pushed(OnPlane):
-    """x'' = push."""
-
-    inputs = jj.inputs("push")
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
-
-
-def test_samples_that_lanes_share_are_given_once():
-    times, run = (
-        [0.0, 0.5, 2.0],
-        lambda x, values: (
-            jj.simulate(Pushed(), {"x": x}, ts=[0.1], inputs={"push": jj.Sampled(times, values)}).q_end
-        ),
-    )
-    xs, values = np.linspace(0.4, 0.6, 7), np.array([0.0, 1.0, 0.3])
-    cases = [
-        (lambda x: run(x, values), xs, "1x2x3"),
-        (lambda values: run(0.3, values), jnp.outer(xs, values), "7x1x2x3"),
-    ]
-    expected = [jax.jit(jax.vmap(of))(varied) for of, varied, _ in cases]
-    with gpu_twin.in_place_of_a_gpu():
-        for (of, varied, tables), right in zip(cases, expected, strict=True):
-            program = jax.jit(jax.vmap(of))
-            assert f"(tensor<{tables}xf64>, " in program.lower(varied).as_text()
-            assert_array_equal(program(varied), right)
 
 
 def test_no_lanes_are_no_call_that_fails():
