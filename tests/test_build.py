@@ -58,27 +58,6 @@ def test_what_was_built_is_pickled_as_its_scene(disc):
     assert again.freedoms == disc.freedoms
 
 
-def test_what_was_built_stands_wherever_its_scene_does():
-    start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
-    data = jj.Experiment(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
-
-    def asked(scene):
-        state = jj.start(scene, **start)
-        lanes = jj.rollout(scene, {"x_rate": jnp.array([0.5, 0.6])}, ts=ts).lanes
-        numbers = (
-            jj.simulate(scene, start, ts=ts).q,
-            lanes.q,
-            state.u,
-            jj.linearize(scene, state).A,
-            jj.fit(scene, data, free=["offset"]).values,
-        )
-        return jax.tree.map(np.asarray, numbers), str(jj.report(scene)), jj.lower(scene)
-
-    of_model, of_scene = asked(jj.build(ChaplyginSleigh())), asked(ChaplyginSleigh())
-    jax.tree.map(assert_array_equal, of_model[0], of_scene[0])
-    assert of_model[1:] == of_scene[1:]
-
-
 def test_a_model_says_each_choice_with_its_reason():
     sleigh, rods = ChaplyginSleigh(), DoublePendulumRods()
     assert jj.build(sleigh).way == "machine code"

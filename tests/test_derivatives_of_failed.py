@@ -149,24 +149,6 @@ def test_what_a_motion_says_in_words_and_pictures_needs_its_numbers(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
-    wire, found = BeadOnTurningWire(), []
-    motion = jj.simulate(wire, {"r": 0.5}, ts=[0.1])
-    jax.jit(
-        lambda x: (
-            found.extend(
-                [
-                    jj.analysis.energy_balance(wire),
-                    motion.raise_if_failed().message,
-                    jj.sample_states(wire, 1)[1].shape,
-                ]
-            )
-            or x
-        )
-    )(0.5)
-    assert found == [jj.analysis.energy_balance(wire), motion.message, (1, 1)]
-
-
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 @pytest.mark.parametrize("backend", ["auto", "xla"])
 def test_a_wrong_parameter_has_derivatives_that_are_nan(derivative, backend):

@@ -92,34 +92,6 @@ def test_lanes_are_those_of_vmap(f):
         assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-def test_what_all_lanes_share_has_no_axis_of_lanes():
-    random = np.random.default_rng(0)
-    x, A = random.normal(size=4), random.normal(size=(5, 3, 4))
-    found, expected = (
-        uncompiled_lanes(_products, shared=1)(x, A),
-        jax.jit(jax.vmap(_products, in_axes=(None, 0)))(x, A),
-    )
-    jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, expected)
-
-
-def test_what_no_result_needs_is_not_worked_out():
-    asked = []
-    seen = lambda x: asked.append(1) or x
-
-    @jax.jit
-    def both(x):
-        return jax.pure_callback(seen, x, x), 2 * x
-
-    assert uncompiled_lanes(lambda x: both(x)[1])(np.ones(3)).tolist() == [2.0, 2.0, 2.0]
-    assert not asked
-
-
-def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
-    f = jax.vmap(jnp.linalg.cholesky)
-    A = np.stack([np.eye(2), -np.eye(2)])
-    assert_array_equal(np.isnan(uncompiled_lanes(f, None)(A)), np.isnan(f(A)))
-
-
 def test_integers_and_rounding_run_uncompiled_are_those_of_jax():
     n, flags = np.array([5, 6, -7]), np.array([True, False, True])
     x = np.array([0.5, 1.5, 2.5, -0.5, -2.5, 0.49999999999999994, 3.2, -3.7])

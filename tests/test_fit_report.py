@@ -7,7 +7,6 @@ import re
 import sys
 from xml.etree import ElementTree
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -15,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 import jourdain_jax as jj
-from jourdain_jax.identification import Sensor, log_likelihood
+from jourdain_jax.identification import Sensor
 from jourdain_jax.studies import Normal
 
 # The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and
@@ -187,19 +186,6 @@ def test_a_report_without_matplotlib_has_all_words_and_says_what_to_install(fitt
     assert "install it with: pip install &#x27;jourdain-jax[plot]&#x27;" in text
 
 
-def test_many_long_runs_stay_below_two_megabytes(tmp_path):
-    runs = [
-        measured(seed, {"x_rate": -0.5 - 0.01 * seed, "heading_rate": 0.9}, jnp.linspace(0.0, 4.0, 3001))
-        for seed in range(30)
-    ]
-    fit = jj.fit(TRUTH.replace(offset=0.26), runs, free=("offset",))
-    fit.report(tmp_path / "fit.html", runs[:30], held_out=measured(40))
-    assert (tmp_path / "fit.html").stat().st_size < 2e6
-    # span, eight runs of thirty, two channels, priors
-    assert len(sections(tmp_path / "fit.html")["Information on each unknown"]["unknown"]) == 1 + 8 + 2 + 1
-    assert "20 more are not drawn" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-
-
 def test_profiles_stand_in_the_report_and_the_bootstrap_has_gone(fitted, tmp_path):
     fit, data = fitted
     along = fit.profiles(data, "offset")
@@ -207,23 +193,6 @@ def test_profiles_stand_in_the_report_and_the_bootstrap_has_gone(fitted, tmp_pat
     assert list(sections(tmp_path / "fit.html")["Profile likelihood"]) == [str(along["offset"])]
     with pytest.raises(AttributeError, match=r"`Fit\.profiles`.*`fit_batch`"):
         fit.bootstrap  # noqa: B018
-
-
-def test_report_tells_the_way_to_the_minimum(tmp_path):
-    data = jj.Experiment(TS, measured(0).values, 0.01, start=START)
-    guess = TRUTH.replace(offset=0.3)
-    fit = jj.fit(guess, data, free={"offset": jj.bounds(0.05, 1.0)}, guesses=4)
-    (what, costs), logs = fit.trace[0], np.log(0.01 * np.sqrt(2 * np.pi)) * 81
-    assert what == "whole runs"
-    assert len(costs) == int(fit.steps) + 1
-    assert costs[-1] == pytest.approx(0.5 * float(fit.chi_square), rel=1e-9)
-    alone = jj.fit(guess, data, free=("offset",))
-    assert alone.trace[0][1][0] == pytest.approx(-float(log_likelihood(guess, data)) - logs, rel=1e-6)
-    assert np.all(np.diff(alone.trace[0][1]) <= 1e-6)
-    fit.report(tmp_path / "fit.html")
-    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
-    assert f"{int(fit.agreeing)} of 4 first guesses led to this minimum" in text
-    assert sections(tmp_path / "fit.html")["Path to the minimum"]["whole runs"][0] == str(int(fit.steps))
 
 
 def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
@@ -240,17 +209,6 @@ def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
     assert_allclose(float(time.split()[1]), -0.1 / np.log(rho), rtol=0.06)
     assert_allclose(float(narrow.split()[1]), np.sqrt((1 + rho) / (1 - rho)), rtol=0.06)
     assert "intervals from the sigmas are too narrow" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-
-
-def test_names_that_no_data_tell_stand_in_the_report(tmp_path, drawn):
-    data = measured(0)
-    fit = jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia", "mass"))
-    fit.report(tmp_path / "fit.html", data, profiles=("mass",))
-    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
-    assert "`inertia` and `mass` are not determined separately" in text
-    assert any(text.get_text() == "not determined" for text in drawn[0].axes[0].texts)
-    assert "profile flat" in text
-    assert list(sections(tmp_path / "fit.html")["Information on each unknown"]) == ["unknown", "offset"]
 
 
 def test_a_notebook_shows_how_well_each_unknown_is_known(fitted, drawn):

@@ -142,7 +142,7 @@ def test_the_stated_pose_is_the_example():
     assert start["elbow"] == pytest.approx(np.deg2rad(10))
     assert start["al_one"] == pytest.approx(np.deg2rad(20))
     assert scene.domain["elbow"] == (-np.deg2rad(30), np.deg2rad(30))
-    for turn in ("0 1 0 0", "0 0 1 0", "0 0.1 0.2 1", "0.3 -0.5 0.1 0.2"):
+    for turn in ("0 1 0 0", "0.3 -0.5 0.1 0.2"):
         text = (
             f'<mujoco><worldbody><body name="b" quat="{turn}"><freejoint/><geom'
             ' size="1"/></body></worldbody></mujoco>'

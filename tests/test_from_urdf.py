@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from refusals import refused
-from tolerances import ROUND_OFF, relative_error, tolerance
+from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations import unconstrained_equations
@@ -58,50 +58,6 @@ ARM = """
 
 def rpy(roll, pitch, yaw):
     return jj.rot_z(yaw) @ jj.rot_y(pitch) @ jj.rot_x(roll)
-
-
-class ByHand(jj.Scene):
-    """The arm of the text above, written by hand."""
-
-    coordinates = jj.coordinates("turn slide follow")
-
-    def bodies(self, t, q):
-        k, angle = np.array([0.0, 1.0, 1.0]) / np.sqrt(2), q.turn
-        K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-        first = rpy(0.1, 0.2, 0.3) @ (np.eye(3) + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * K @ K)
-        start = jnp.array([0.1, 0.2, 0.3])
-        matrix = np.array([[0.1, 0.01, -0.02], [0.01, 0.12, 0.005], [-0.02, 0.005, 0.09]])
-        own = rpy(0.3, -0.4, 0.5)
-        second = first @ rpy(0.0, 0.0, 1.0)
-        middle = start + first @ jnp.array([0.0, 0.0, 0.4]) + second @ jnp.stack([0.0, 0.0, q.slide])
-        third = second @ jj.rot_x(q.follow)
-        return {
-            "first": jj.RigidBody(
-                2.0, own @ matrix @ own.T, start + first @ jnp.array([0.1, 0.2, 0.3]), first
-            ),
-            "second": jj.RigidBody(
-                1.5, jnp.array([0.02, 0.03, 0.04]), middle + second @ jnp.array([0.0, 0.1, 0.0]), second
-            ),
-            "third": jj.RigidBody(
-                0.5, 0.01 * jnp.ones(3), middle + second @ jnp.array([0.3, 0.0, 0.0]), third
-            ),
-        }
-
-    def loads(self, motion):
-        return jj.gravity(motion, 9.81), jj.generalized_force(motion, turn_rate=-0.7 * motion.u.turn_rate)
-
-    def geometric_constraints(self, pose):
-        return {"follow": pose.q.follow - 2 * pose.q.slide - 0.1}
-
-
-def test_an_arm_moves_as_one_that_is_written_by_hand():
-    arm, by_hand = jj.from_urdf(ARM)(), ByHand()
-    for t, q, u in zip(*jj.sample_states(by_hand, 3), strict=True):
-        own, expected = (unconstrained_equations(scene, t, q, u) for scene in (arm, by_hand))
-        for what in ("M", "h", "Q"):
-            assert relative_error(getattr(own, what), getattr(expected, what)) < ROUND_OFF
-        own, expected = (jj.accelerations(scene, t, q, u).udot for scene in (arm, by_hand))
-        assert relative_error(own, expected) < ROUND_OFF
 
 
 def test_a_file_is_read_as_its_text_is(tmp_path):

@@ -123,16 +123,6 @@ def test_a_scene_is_drawn_at_its_example_start_in_a_notebook(drawn):
     assert ">mass</th>" in broken
 
 
-def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
-    shown = motion._repr_html_()
-    assert shown.startswith("<pre>Trajectory of ")
-    assert shown.count("<img") == len(drawn) == 1
-    low, high = float(motion["x"].min()), float(motion["x"].max())
-    axes = {axes.get_title(): axes for axes in drawn[0].axes}
-    assert len(axes) == len(motion.scene.coordinate_names.entries)
-    assert np.ptp(axes[f"x: {low:.3g} to {high:.3g}"].lines[0].get_ydata()) == high - low
-
-
 def test_a_rollout_shows_medians_and_bands_of_its_coordinates_in_a_notebook(lanes, drawn):
     shown = lanes._repr_html_()
     names = lanes.lanes.scene.coordinate_names.entries

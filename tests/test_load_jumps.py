@@ -106,33 +106,6 @@ def test_a_derivative_across_a_jump_warns_where_no_step_ends_there():
     assert len(warned(slope, -0.1)) == 1  # whether the jump is met is not seen
 
 
-class UntilThere(Pushed):
-    """Ends at the place of the jump."""
-
-    def events(self, motion):
-        return {"there": motion.q.x - 0.2}
-
-
-def test_a_motion_that_ends_at_the_jump_and_another_after_it_have_the_right_derivative():
-    """With the jump at s = 0.2/k, y(1) = s^2/2 + s (1 - s) + (1 - s)^2 and dy/dk = -(1 - s) ds/dk = 0.2 (1 -
-    s)/k^2.
-    """
-    before, after = UntilThere(push=lambda m, p: 1.0 + 0.0 * p), Pushed(push=lambda m, p: 2.0 + 0.0 * p)
-
-    def in_two(k):
-        first = jj.simulate(before, {"x": 0.4, "x_rate": -k}, t1=1.0, work=False)
-        return jj.simulate(after, first.end, t1=1.0, work=False).q_end[1]
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", jj.SensitivityWarning)
-        value, slope = jax.value_and_grad(in_two)(0.5)
-    assert value == pytest.approx(0.08 + 0.4 * 0.6 + 0.36, abs=1e-6)
-    assert slope == pytest.approx(0.2 * 0.6 / 0.25, abs=1e-6)
-    value_in_one, slope_in_one = jax.value_and_grad(end(JUMPS["at a place"]))(-0.5)
-    assert value_in_one == pytest.approx(float(value) + 0.1, abs=1e-6)  # with 0.1 m/s along y
-    assert slope_in_one == pytest.approx(-float(slope), abs=1e-6)
-
-
 def test_values_kinks_and_times_that_no_parameter_moves_do_not_warn():
     f = end(JUMPS["at a place"])
     assert not warned(f, -1.0)
@@ -244,19 +217,6 @@ def test_linearizing_where_a_load_has_no_slope_warns(name):
     assert [
         "the force along `y_rate`" in str(w.message) for w in given if w.category is jj.SensitivityWarning
     ] == [True] * (name in ROUGH)
-
-
-def test_a_linearization_at_rest_on_dry_friction_says_so():
-    scene = Pushed(push=JUMPS["friction"])
-    with pytest.warns(
-        jj.SensitivityWarning, match="the force along `y_rate` has no derivative at this state"
-    ) as said:
-        jj.linearize(scene, {"y_rate": 0.0})
-    assert said[0].filename == __file__
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        jj.linearize(scene, {"y_rate": 0.1})
-        jax.jit(lambda u: jj.linearize(scene, jj.start(scene, y_rate=u)).A)(0.1)
 
 
 ONE_SIGN = {  # at all probed states; u_y(4) from rest at x = 0 with 3 m/s along x

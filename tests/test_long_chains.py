@@ -5,17 +5,12 @@ Sparse matrices are compared with dense matrices.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
-from jourdain_jax.lowering import ignorable
-from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.identity_test import identity_probes
 from jourdain_jax.structure.assembly import assemble
 
 
@@ -85,20 +80,3 @@ def test_nearly_dependent_rows_are_known_although_every_pivot_is_large():
     f = np.random.default_rng(4).normal(size=(1, n))
     assert pattern.is_sparse
     assert_allclose(pattern.shortest(values, f), shortest(pattern.dense(values), f), rtol=1e-6)
-
-
-def test_what_acts_by_less_than_round_off_is_not_left_out():
-    n = 8
-    graph = Graph()
-    headings = [graph.input(f"q_{i}", True) for i in range(n)]
-    rate = graph.one
-    for (
-        q
-    ) in headings:  # the last one changes the rate by some 1e-5 to the power of the number of those before
-        rate = graph.add(graph.one, graph.mul(graph.const(1e-5), graph.mul(graph.call("cos", q), rate)))
-    states = {f"q_{i}": np.random.default_rng(i).normal(size=12) for i in range(n)}
-    builder = SimpleNamespace(graph=graph, identity_probes=identity_probes(Probes(graph, states), ()))
-    assert ignorable._with_slopes(builder, [rate], headings, np.ones(12, bool)) == set(headings)
-    sine, cosine = (graph.call(name, headings[1]) for name in ("sin", "cos"))
-    none = graph.add(graph.mul(sine, sine), graph.mul(cosine, cosine))
-    assert ignorable._with_slopes(builder, [none], headings[1:2], np.ones(12, bool)) == set()
