@@ -211,7 +211,8 @@ def turned_inertias(moments, generator):
     return (inertias + inertias.mT) / 2
 
 
-def test_an_inertia_is_impossible_where_a_moment_is_negative_or_above_the_sum_of_the_others():
+@pytest.mark.parametrize("backend", ["native", "dense"])
+def test_an_inertia_is_impossible_where_a_moment_is_negative_or_above_the_sum_of_the_others(backend):
     generator = np.random.default_rng(0)
     moments = generator.uniform(0.01, 1.0, size=(300, 3))
     moments *= np.where(generator.uniform(size=(300, 3)) < 0.15, -1.0, 1.0)
@@ -227,6 +228,7 @@ def test_an_inertia_is_impossible_where_a_moment_is_negative_or_above_the_sum_of
         {"attitude_omega_x": 1e-3},
         parameters={"inertia": turned_inertias(scales * moments, generator)},
         ts=[1e-6],
+        backend=backend,
     )
     assert_array_equal(lanes.result == results.BAD_PARAMETER, wrong)
 
