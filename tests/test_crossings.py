@@ -246,7 +246,7 @@ def test_steps_are_no_longer_than_a_part_of_the_span(way):
     unbound, usual, short = (
         steps(**WAYS[way], **more) for more in ({"max_step": np.inf}, {}, {"max_step": 0.01})
     )
-    assert unbound < 16 <= usual < 40
+    assert unbound < 14 <= usual < 40
     assert 300 <= short < 330
 
 

@@ -26,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference
 
 MEMORY = 2**32  # tuning: bytes, unless a model sets a limit
-LONGEST = 1 / 16  # numerics: default of the longest step, relative to the span
+LONGEST = 1 / 14  # numerics: default of the longest step, relative to the span
 
 
 class Passed(eqx.Module):

@@ -40,7 +40,7 @@ class Options:
       `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`. `diffrax.diffeqsolve` runs diffrax's solvers,
       except Tsit5, Dopri5 and Dopri8, which run in this package's loop. The last three solvers of `jj` take
       equal steps of at most their `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
-    - `max_steps`: maximum number of steps; `max_step`: the longest step (s). None: 1/16 of the span, so that
+    - `max_steps`: maximum number of steps; `max_step`: the longest step (s). None: 1/14 of the span, so that
       brief loads and brief dips of event values are not missed; inf: no limit.
     - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a
       motion; events after which it continues stay active. `work`: integrate the work of loads that have no
@@ -223,8 +223,8 @@ _NUMBERS = {  # condition, expectation and advice
     "atol": _POSITIVE,
     "max_step": (
         lambda x: x > 0,
-        "a positive time in s; None limits steps to 1/16 of the span, inf sets no limit",
-        "pass the longest step in s, None for 1/16 of the span, or inf for no limit",
+        "a positive time in s; None limits steps to 1/14 of the span, inf sets no limit",
+        "pass the longest step in s, None for 1/14 of the span, or inf for no limit",
     ),
 }
 
