@@ -251,9 +251,9 @@ def start_counting(w: Writer, job: Value, word: int) -> None:
     w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
 
 
-def next_lane(w: Writer, job: Value, word: int) -> Value:
-    """Take the next lane and return its index."""
-    return w.counted_up(w.load(job, word, "ptr"), 0) if w.device else w.counted_up(job, word)
+def next_lane(w: Writer, job: Value, word: int, lanes: int = 1) -> Value:
+    """Take the next `lanes` lanes and return the index of the first."""
+    return w.counted_up(*(w.load(job, word, "ptr"), 0) if w.device else (job, word), lanes)
 
 
 def lanes_taken(w: Writer, job: Value, word: int) -> Value:
@@ -341,25 +341,30 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
     """Write a handler that maps rows of `given` numbers to rows of `returned` numbers. The handler calls the
     module's `row(given, returned)` for several lanes at once.
 
-    Lanes beyond the last row repeat that row.
+    Lanes beyond the last row repeat that row, and its results.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")
+        state, found = w.room(given), w.room(returned)
         rows, results, count = w.load(job, IN, "ptr"), w.load(job, OUT, "ptr"), w.load(job, COUNT, "i64")
         shared = w.load(job, SHARED, "ptr") if w.device else w.null
         with w.repeated() as leave:
             leave(~w.together(lanes_taken(w, job, NEXT) < count))
-            with w.each_lane() as lane:
-                number = next_lane(w, job, NEXT)
-                w.store(number, who, lane)
-                known = w.where(number < count, number, count - 1)
-                for some, _, numbers in sources(w, given, of_lane(w, rows, count, given, known), shared):
-                    taken_in(w, len(some), numbers, w.at(state, some.start), lane)
+            first = next_lane(w, job, NEXT, w.lanes)
+            each = [w.where(first + lane < count, first + lane, count - 1) for lane in range(w.lanes)]
+            own, into = (
+                [of_lane(w, array, count, numbers, lane) for lane in each]
+                for array, numbers in ((rows, given), (results, returned))
+            )
+            # all lanes in one pass of a loop over rows
+            for some in zip(*(sources(w, given, numbers, shared) for numbers in own), strict=True):
+                begin = w.at(state, some[0][0].start)
+                with w.counted(len(some[0][0])) as row:
+                    for lane, (_, _, numbers) in enumerate(some):
+                        w.store(w.load(numbers.place(row), type="double"), begin, row * w.lanes + lane)
             w.run("row", state, found)
-            with w.each_lane() as lane:
-                number = w.load(who, lane, "i64")
-                with w.when(number < count):
-                    handed_out(w, returned, found, lane, of_lane(w, results, count, returned, number))
+            with w.counted(returned) as row:
+                for lane, numbers in enumerate(into):
+                    w.store(w.load(found, row * w.lanes + lane, "double"), numbers.place(row))
         w.give(w.null)
 
     def body(arguments: list[Given], results: list[Given]) -> None:

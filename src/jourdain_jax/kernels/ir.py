@@ -352,10 +352,10 @@ class Writer:
             found.append(self.instruction("ptr", f"load volatile ptr, ptr {place.name}"))
         return found
 
-    def counted_up(self, pointer: Value, index) -> Value:
-        """Atomically increment an integer in memory and return its old value."""
+    def counted_up(self, pointer: Value, index, by: int) -> Value:
+        """Atomically increase an integer in memory and return its old value."""
         return self.instruction(
-            "i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic"
+            "i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 {by} monotonic"
         )
 
     def store(self, value, pointer: Value, index=0) -> Value:
