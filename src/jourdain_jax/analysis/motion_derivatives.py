@@ -175,7 +175,7 @@ class ByMatrices:
             v = [coordinate_rates(scene, t, q, u), found.udot, closure_residual(scene, t, q), rows.phi]
             return jnp.concatenate(v), equations.M
 
-        x = jnp.concatenate([t[None], q, u, f])
+        x = jnp.hstack([t, q, u, f])
         v, slope, M = jax.linearize(instant, x, has_aux=True)
         return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
 

@@ -107,7 +107,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     nominal = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
     physical = np.asarray(drawn.physical)
     # an impossible sample is replaced by the measured values and not counted
-    values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
+    values = jnp.vstack([nominal, jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
     grid = _speeds_to_draw(weave, capsize, float(found.double_root_speed[0]))

@@ -154,7 +154,7 @@ def _speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
 
     def between(v):
         """Return the ends of the intervals between speeds, and the eigenvalues within each interval."""
-        ends = jnp.sort(jnp.concatenate([jnp.zeros(1), jax.lax.stop_gradient(v), top[None]]))
+        ends = jnp.sort(jnp.hstack([0.0, jax.lax.stop_gradient(v), top]))
         at = lambda v: _eigenvalues(jax.lax.stop_gradient(matrices), v)
         return ends, jax.vmap(at)((ends[:-1] + ends[1:]) / 2)
 

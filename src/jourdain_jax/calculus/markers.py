@@ -246,7 +246,8 @@ def _leaving(primals, tangents):
 
 
 def _any(m, x, lanes):
-    return m.any(x.astype(bool), axis=tuple(range(lanes, x.ndim))).astype(x.dtype)
+    """Return 1 where any number is not zero, NaN where any is NaN, otherwise 0."""
+    return m.max(m.abs(m.sign(x)), axis=tuple(range(lanes, x.ndim)), initial=0.0).astype(x.dtype)
 
 
 def _over(counts, x):
@@ -270,7 +271,7 @@ def _lost(m, failed, before, asked, count, x, *, lanes):
 
 def _lost_and_counted(m, failed, asked, x, *, lanes):
     x = m.where(failed & (x != 0), m.nan, x).astype(x.dtype)
-    return m.where(_any(m, m.isnan(x), lanes), m.nan, _any(m, x, lanes)).astype(x.dtype), x
+    return _any(m, x, lanes), x
 
 
 def _counted_back(cotangents, x, *, lanes):

@@ -156,7 +156,7 @@ def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
     """
     half = _angle(angle) / 2
     axis = checked_real(axis, "axis of a quaternion", (3,), advice="pass a unit vector")
-    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+    return jnp.hstack([jnp.cos(half), jnp.sin(half) * axis])
 
 
 def vec(x: Number, y: Number, z: Number) -> Float[Array, "*times 3"]:

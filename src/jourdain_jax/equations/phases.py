@@ -334,7 +334,7 @@ def contacts_at_start(at: At) -> Float[Array, "numbers"]:
     then = at.then(numbers, begun.slots, q, u)
     bears = jnp.stack([_bearing(then, i) > 0 for i in range(len(numbers))])
     numbers = jnp.where((numbers == SLIPS) & ~bears, PAINLEVE, numbers)
-    return jnp.concatenate([numbers, jnp.max(-gap, initial=0.0)[None], q, u])
+    return jnp.hstack([numbers, jnp.max(-gap, initial=0.0), q, u])
 
 
 def _bearing(at: At, i: int) -> Scalar:

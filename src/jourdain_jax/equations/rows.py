@@ -231,7 +231,7 @@ def in_whole_scene(scene: Scene, motion: Motion) -> tuple[Scene, Motion, PerRow 
     slips = {name: unit(contacts[name].slip(motion)) for name, number in phase if number == SLIPS}
     whole, numbers = switched(scene, switching_of(scene)), jnp.array([number for _, number in phase])
     q = jnp.concatenate([motion.q.array, *(slips.get(name, jnp.zeros(2)) for name, _ in phase)])
-    inputs = jnp.concatenate([jnp.zeros(1), motion.inputs.array, numbers])
+    inputs = jnp.hstack([0.0, motion.inputs.array, numbers])
     motion = motion_at(whole, motion.t, q, motion.u.array, inputs)
     return whole, motion, jnp.outer(numbers == SLIPS, jnp.array([0.0, 1.0, 1.0])).ravel()
 

@@ -252,7 +252,7 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     equations = equations_of(scene, instant, loads_of(scene, motion))
     held, rows = rows_of(scene, instant), contact_rows(scene, motion)
     count, kept = len(motion.u.array), len(held.phi)
-    right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
+    right = jnp.vstack([rows.A, equations.Q - equations.h, held.A]).T
     # in reverse order: the last speeds belong to the leaves of a tree of bodies, and eliminating them first
     # creates no fill-in
     moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1]), vanishes=False))[::-1]

@@ -44,7 +44,7 @@ def knots_between(samples: Sequence[Sampled], rtol, t0, t1, ts: PerTime) -> Floa
     is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
     since = jnp.sort(jnp.where(is_end | (number < 0) | (number > span), jnp.inf, since))
     number = jax.lax.stop_gradient(since)
-    repeated = jnp.concatenate([jnp.zeros(1, bool), number[1:] - number[:-1] <= near])
+    repeated = jnp.append(False, number[1:] - number[:-1] <= near)
     return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
 
 
@@ -70,7 +70,7 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
     # if `bent` at a knot, a step ends at the previous knot
-    return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
+    return jnp.hstack([v[1] != v[0], bent[1:], v[-1] != v[-2]])
 
 
 class SeenFromWithin(eqx.Module):

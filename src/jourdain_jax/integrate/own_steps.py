@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE, DifferentiationModeError
 from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_derivatives_of, with_rules
-from jourdain_jax.calculus.reals import Indices, is_traced
+from jourdain_jax.calculus.reals import Indices, at_index, is_traced
 from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays
 from jourdain_jax.integrate.explicit_steps import Method, method_of
@@ -171,13 +171,15 @@ def _moved(mover: Callable, found: Solved, args: tuple, shared: tuple, times: Ti
     by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))
     by = jnp.where(by_goal, goals - number + later, jnp.where(event, 0.0, later))
     at = numbers(start) + jnp.where(by_goal, number, t_end)
+    every = jax.tree.map(lambda ys, y: jnp.concatenate([ys, y[None]]), found.ys, found.y_end)
+    every = jax.vmap(moved)(every, at, by)
     return eqx.tree_at(
         lambda s: (s.ts, s.ys, s.y_end, s.t_end, s.passed.ts),
         found,
         (
             goals[:-1],
-            jax.vmap(moved)(found.ys, at[:-1], by[:-1]),
-            moved(found.y_end, at[-1], by[-1]),
+            at_index(every, slice(-1)),
+            at_index(every, -1),
             found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
             passed.ts - later,
         ),

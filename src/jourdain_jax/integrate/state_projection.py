@@ -227,7 +227,7 @@ def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
     """Return the solution from the first successful guess, beginning with q itself."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
-    every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
+    every = jnp.where(free, jnp.vstack([q, guesses]), q)
     by = functions_of_rows(usual)
     given = by.given(scene)
     G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)

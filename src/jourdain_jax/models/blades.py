@@ -265,8 +265,8 @@ class TrailerChain(Scene):
         rate (rad/s) of the car.
         """
         headings, lengths = jnp.asarray(headings), self._per_trailer(self.length)
-        x = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.cos(headings[1:]))])
-        y = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.sin(headings[1:]))])
+        x = jnp.append(0.0, -jnp.cumsum(lengths * jnp.cos(headings[1:])))
+        y = jnp.append(0.0, -jnp.cumsum(lengths * jnp.sin(headings[1:])))
         values = {
             f"{name}{i}": given[i]
             for name, given in (("x", x), ("y", y), ("heading", headings))

@@ -27,7 +27,7 @@ class _OnSheets(Scene):
     def _with_plane(self, normal) -> dict:
         """Return shapes to draw: the particle, and the plane of allowed velocities with this normal."""
         normal = normal / jnp.sqrt(normal @ normal)
-        turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
+        turn = jnp.vstack([tangents_of(normal), normal]).T
         return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}
 
 

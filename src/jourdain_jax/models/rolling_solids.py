@@ -91,7 +91,7 @@ class BallOnTurntable(Heavy):
     def _axes(self) -> Matrix3:
         """Return downhill, level and normal unit vectors of the table, as rows."""
         table = Plane(tilt=self.tilt)
-        return jnp.concatenate([table.tangents, table.normal[None]])
+        return jnp.vstack([table.tangents, table.normal])
 
 
 class Rattleback(Heavy):

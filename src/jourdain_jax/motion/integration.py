@@ -164,10 +164,8 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     saved = sound & solved.reached & (solved.ts * direction <= solved.t_end * direction)
     # unreached times may hold any value: compute at the end state, then mark as NaN
     first, last, ys = begun.y0.rows, solved.y_end.rows, jax.vmap(lambda y: y.rows)(solved.ys)
-    ts = jnp.concatenate(
-        [jnp.zeros_like(last, shape=1), jnp.where(saved, solved.ts, solved.t_end), solved.t_end[None]]
-    )
-    rows = jnp.concatenate([first[None], jnp.where(saved[:, None], ys, last), last[None]])
+    ts = jnp.hstack([0.0, jnp.where(saved, solved.ts, solved.t_end), solved.t_end])
+    rows = jnp.vstack([first, jnp.where(saved[:, None], ys, stopped(last)), last])
 
     def at_state(tau, rows):
         y = begun.y0.with_rows(rows)

@@ -354,7 +354,7 @@ def any_wrong(stacked: dict[str, Array], moments: bool) -> Flag:
     """
     checks = [check for check in CHECKS if check.label and (check.group == "moments") == moments]
     found = [check.wrong(stacked[check.of]).ravel() for check in checks if check.of in stacked]
-    return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
+    return jnp.any(jnp.hstack([False, *found]))
 
 
 def impossible_bodies(scene: Scene, q) -> Sentences:

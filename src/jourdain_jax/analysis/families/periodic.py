@@ -198,7 +198,7 @@ def _found(problem: Shooting, start: State, period: Scalar) -> PeriodicMotion:
     t, begun = problem.t, jnp.concatenate([start.q, start.u])
     still, z, given = jax.lax.stop_gradient((problem, begun, period))
     motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)
-    zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
+    zs = jnp.vstack([z, jnp.hstack([motion.q, motion.u])[:-1]])
     guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
     size = jnp.where(problem.is_unknown, jnp.append(jnp.tile(problem.sizes, problem.pieces), given), 0.0)
     rows = lambda x: problem.rows(x, problem.ends(x))

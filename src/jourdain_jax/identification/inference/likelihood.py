@@ -251,7 +251,7 @@ class _Filter:
         """Return q, x, P at the time t1, which may equal t."""
         moves = t1 > t
         span = jnp.where(moves, t1 - t, (self.run.ts[-1] - self.run.t0) / self.run.ts.shape[0])
-        times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
+        times = jnp.hstack([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)])
 
         def later(x):
             motion = simulate(

@@ -208,7 +208,7 @@ class Informed:
         """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
-        total = np.concatenate([[0.0], np.cumsum(told)])
+        total = np.append(0.0, np.cumsum(told))
         # end index of the span that begins at each sample
         last = np.searchsorted(total, total[:-1] + 0.5 * total[-1] * (1 - 1e-9))
         begins = np.flatnonzero(last < len(total))

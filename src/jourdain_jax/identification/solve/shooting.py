@@ -160,7 +160,7 @@ def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
     for name in run.values:
         late = latest(run.sensors[name].delay) if name in run.sensors else 0.0
         inner = np.searchsorted(ts, ts[ends[1:-1]] + late - 1e-9 * (ts[-1] - ts[0]))
-        found[name] = np.concatenate([[0], inner, [len(ts)]])
+        found[name] = np.hstack([0, inner, len(ts)])
     return found
 
 

@@ -131,7 +131,7 @@ def cotangents(
     tries = accepted + rejected
     if form.has_events:  # trial steps that locate an event are not counted; few events need as many as eight
         tries += 8 * (1 + crossings + sum(passed))
-    ends = jnp.concatenate([g.end[0], g.t[0][None], g.log[0]])
+    ends = jnp.hstack([g.end[0], g.t[0], g.log[0]])
     back = flow_back(form, method, asked, memory)(start, g.y[0], ends, tries)
     return back[: form.y], entries_of(back[form.y :])
 

@@ -293,16 +293,16 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
 
 def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
     """Return two functions from parts of x to values of nodes, by XLA and by machine code. Both first take
-    `plain`, the first parts without derivatives, which machine code uses. It returns only nonzero nodes,
-    because the whole matrix of 32 trailers would not fit on its stack.
+    `plain`, parts without derivatives, for machine code, which returns only nonzero nodes to save stack.
     """
     number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
     which = np.array([number.get(n, len(number)) for n in nodes], int)
-    in_order = bool(number) and np.array_equal(which, np.arange(len(number)))
+    in_order = np.array_equal(which, np.minimum(np.arange(len(which)), len(number)))  # then zeros
     kernel = nodes_called(graph, list(number), variables, effort=0)
 
     def placed(found):
-        return found if in_order else jnp.append(found, jnp.zeros((), found.dtype))[which]
+        padded = jnp.append(found, jnp.zeros(len(which) - len(number) if in_order else 1))
+        return padded if in_order else padded[which]
 
     def by_xla(plain, *parts):
         x = jnp.hstack(parts)

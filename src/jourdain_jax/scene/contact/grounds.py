@@ -131,7 +131,7 @@ class Plane(_Ground):
         """Return the rotation matrix from components in the plane to the inertial frame: its columns are the
         two tangents and the normal.
         """
-        return jnp.concatenate([self.tangents, self.normal[None]]).T
+        return jnp.vstack([self.tangents, self.normal]).T
 
     def height_of(self, position: Vector) -> Scalar:
         """Return the signed distance (m) of the point at `position` (m, inertial frame) from the plane,
