@@ -289,13 +289,3 @@ def test_functions_that_differ_in_a_constant_are_not_one_call():
 
     graph, (node,) = in_parts(f, 0.0)
     assert_allclose(Probes(graph, {"0_0": np.array([0.0, 1.0, 2.0])})([int(node)])[0], [11.0, 22.0, 43.0])
-
-
-def test_a_choice_that_is_known_is_made_and_numbers_stay_numbers():
-    def f(x):
-        sign = jax.lax.cond(jnp.arange(3)[1] == 1, lambda x: x, lambda x: -x, x)
-        return sign + jnp.sort(jnp.array([3.0, 1.0]))[0] + 0 * by_iteration(x, jnp.ones(1))
-
-    graph, (node,) = in_parts(f, 0.0)
-    assert graph.calls([int(node)]) == []
-    assert graph.operations([int(node)]) == 1

@@ -1,6 +1,5 @@
 """Particles under one row: Rosenberg's and Heisenberg's, a spring and a rod, and one of constant speed."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_form_runs import end_error
@@ -11,24 +10,11 @@ from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 from jourdain_jax.models import HeisenbergParticle, IsokineticParticle, RosenbergParticle, SpringAndRod
 
 
-def test_rosenbergs_particle_is_bent_by_its_row():
-    q, u, udot, _ = solved_at_random_states(RosenbergParticle(mass=1.7))
-    ax = -q.y * u.x_rate * u.y_rate / (1 + q.y**2)  # xdot sqrt(1 + y^2) is constant
-    expected = jnp.stack([ax, jnp.zeros_like(ax), u.x_rate * u.y_rate + q.y * ax], axis=1)
-    assert relative_error(udot.array, expected) <= ROUND_OFF
-
-
 @pytest.mark.parametrize("b", [rosenberg_particle.RUN["b"], 0.0])
 def test_rosenbergs_particle_follows_its_closed_form(b):
     run = rosenberg_particle.RUN | {"b": b}
     start = {"y": run["y0"], "x_rate": run["c"] / np.sqrt(1 + run["y0"] ** 2), "y_rate": b}
     assert end_error(RosenbergParticle(), start, rosenberg_particle.motion, run, "x y z") <= CLOSED_FORM
-
-
-def test_heisenbergs_particle_needs_no_constraint_force():
-    solved = solved_at_random_states(HeisenbergParticle(mass=1.7))[-1]
-    assert jnp.max(jnp.abs(solved.udot)) <= ROUND_OFF
-    assert jnp.max(jnp.abs(solved.multipliers)) <= ROUND_OFF
 
 
 def test_heisenbergs_particle_moves_straight_and_not_in_helices():

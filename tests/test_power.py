@@ -9,7 +9,7 @@ from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import power
-from jourdain_jax.models import BallOnTurntable, IsokineticParticle, TiltingDisc
+from jourdain_jax.models import IsokineticParticle, TiltingDisc
 
 
 def test_the_wire_does_the_work_that_turns_the_bead():
@@ -33,8 +33,6 @@ def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
     [
         (TiltingDisc(), ()),
         (small.BeadOnTurningWire(), ("poses driven as functions of time",)),
-        (small.BeadOnTurningWire(rate=0.0, damping=0.4), ("loads without a potential",)),
-        (BallOnTurntable(), ("constraints that do real work",)),
         (IsokineticParticle(), ("constraints that do real work",)),
         (
             small.DrivenPendulum(),

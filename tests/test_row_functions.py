@@ -2,37 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-import machine_code
-import numpy as np
 import result_codes as results
 from numpy.testing import assert_allclose
 from refusals import refused
 
 import jourdain_jax as jj
-from jourdain_jax.equations.projection import BY_AUTODIFF
-from jourdain_jax.integrate.constraint_projection import row_functions
 from jourdain_jax.program import interpret
-from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.structure.row_program import row_program
-
-
-@machine_code.needed
-def test_rows_of_a_large_scene_have_the_derivatives_of_the_scenes_own():
-    """Machine code returns the nonzero entries: a whole Jacobian goes beyond the end of its stack."""
-    scene, generator = jj.models.TrailerChain(trailers=16), np.random.default_rng(0)
-    q, u, dq = (jnp.asarray(generator.normal(size=len(scene.coordinate_names))) for _ in range(3))
-    inputs = jnp.zeros(len(scene.inputs))
-
-    def along(by):
-        def all_of(length, q):
-            at = scene.replace(length=length)
-            return by.rows(at, 0.3, q, u, inputs), by.masses(at, 0.3, q), by.closures(at, 0.3, q)
-
-        return lambda q: jax.jvp(all_of, (scene.length, q), (jnp.ones_like(scene.length), dq))
-
-    found, expected = jax.jit(along(row_functions(row_program(scene))))(q), eval_numpy(along(BY_AUTODIFF))(q)
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
 def of_skate(y_rate, run=jj.simulate):

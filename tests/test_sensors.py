@@ -68,7 +68,6 @@ def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_
 
 
 GAIN = jj.Estimate(1.0)
-BIAS = jj.Estimate(0.0, per_run=True)
 DELAY = jj.Estimate(0.05, range=jj.bounds(0.0, SEEN))
 ASKED = {"gain": GAIN, "bias": jj.Estimate(0.0), "delay": DELAY, "lag": jj.Estimate(0.05)}
 
@@ -128,33 +127,6 @@ def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
         axis=1,
     )
     assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
-
-
-def test_a_bias_of_each_run_and_a_delay_that_all_share():
-    biases, ts = (0.05, -0.02, 0.3), np.linspace(1.0, 4.0, 61)
-    runs = [
-        run(
-            k,
-            truth=TRUTH | {"bias": bias},
-            ts=ts[: 61 - 7 * k],
-            x0=0.3 - 0.1 * k,
-            sigma=1e-4,
-            gain=GAIN,
-            bias=BIAS,
-            delay=DELAY,
-        )
-        for k, bias in enumerate(biases)
-    ]
-    found = jj.fit(Cart(), runs, ("damping",))
-    assert found.labels == ("damping", "gyro.delay", "gyro.gain", *(f"run {k}: gyro.bias" for k in range(3)))
-    assert found.converged
-    for name, value in [
-        ("gyro.delay", 0.07),
-        ("gyro.gain", 1.2),
-        *((f"run {k}: gyro.bias", bias) for k, bias in enumerate(biases)),
-    ]:
-        assert abs(found[name].value - value) < 4 * found[name].standard_error, name
-        assert found[name].standard_error < 0.02
 
 
 def test_a_sensor_shows_functions_and_coordinates_under_other_names():
@@ -301,18 +273,6 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     )
 
 
-def test_other_numbers_of_a_sensor_compile_nothing(compilations):
-    for seed, delay in ((5, 0.05), (6, 0.03)):
-        compilations.clear()
-        found = jj.fit(
-            Cart(mass=1.8),
-            [run(seed, delay=jj.Estimate(delay, range=jj.bounds(0.0, 0.15)), gain=1.0 + 0.1 * seed)],
-            ("mass",),
-        )
-        assert found.converged
-    assert not compilations
-
-
 # What is known beforehand. ----------------------------------------------------------------------------------
 
 
@@ -451,13 +411,6 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
     assert (
         max(np.abs(found.residuals[0]["x_rate"])) < 0.05
     )  # of a sigma: samples within half a passage see it
-
-
-def test_a_lag_after_a_command_that_holds():
-    knots, command = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41)
-    actuator = Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
-    found = fitted(actuator, knots, speeds_of_held(knots, command, knots, lag=0.1))
-    assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
 
 def test_numbers_of_an_actuator_are_found_and_known_ones_make_an_input_like_any_other():

@@ -113,25 +113,6 @@ def test_a_page_asks_for_nothing_beyond_itself_and_is_small(shown):
     assert not re.search(r"\bimport\(|XMLHttpRequest|@import", shown.html + code)
 
 
-def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
-    class Struck(Rolling):
-        """Something presses the ball onto the table for a moment."""
-
-        def loads(self, motion):
-            blow = 1e4 * jnp.exp(-(((motion.t - 1.0) / 0.01) ** 2))
-            return jj.gravity(motion, 9.81), jj.point_force(
-                motion["ball"].point(), jnp.stack([0.0, 0.0, -1.0]) * blow
-            )
-
-    page, numbers = contents(jj.show(jj.simulate(Struck(), Struck.example, ts=jnp.linspace(0.0, 2.0, 41))))
-    (force,) = page["motions"][0]["forces"]
-    lengths = np.linalg.norm(numbers(force["vectors"]).reshape(-1, 3), axis=1)
-    weight = 2.0 * 9.81
-    assert "longest arrow: 39.2 N and more, up to 1e+04 N" in page["note"]
-    assert_allclose(lengths[[0, -1]], lengths.max() * weight / (2 * weight), rtol=1e-5)
-    assert lengths.argmax() == 20
-
-
 def test_a_notebook_shows_the_page_in_a_frame(shown):
     frame = shown._repr_html_()
     assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
@@ -149,17 +130,6 @@ def test_whole_turns_between_saved_times_are_kept():
         a, b = attitudes[k : k + 2]
         shortest = 2 * np.arctan2(np.linalg.norm(a[3] * b[:3] - b[3] * a[:3] - np.cross(b[:3], a[:3])), a @ b)
         assert abs(shortest + 2 * np.pi * one) == pytest.approx(abs(turned), abs=1e-6), k
-
-
-def test_lanes_and_lists_lie_over_one_another():
-    sleigh, turning = jj.models.ChaplyginSleigh(), {"heading_rate": np.linspace(0.5, 2.0, 20)}
-    lanes = jj.rollout(sleigh, turning, ts=np.linspace(0, 0.5, 5))
-    page, _ = contents(jj.show(lanes))
-    assert len(page["motions"]) == 12
-    page, _ = contents(jj.show([lanes.lane(0), lanes.lane(7)], follow=True))
-    assert (len(page["motions"]), page["follow"]) == (2, True)
-    page, _ = contents(jj.show(lanes.lane(3), paths=[("sleigh", (0.1, 0, 0))]))
-    assert len(page["motions"][0]["paths"]) == 1
 
 
 def test_bodies_are_guessed_from_contacts_lines_and_inertias():

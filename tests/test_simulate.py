@@ -13,9 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Upright
 
 import jourdain_jax as jj
-from jourdain_jax.equations import Privileged
 from jourdain_jax.identification import log_likelihood
-from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, Snakeboard, TiltingDisc
+from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, TiltingDisc
 
 
 class Falling(Upright):
@@ -126,62 +125,6 @@ def test_simulate_traces_once_for_different_numbers():
         run(scene, jj.start(scene, z_rate=mass))
 
 
-class Trolley(jj.Scene):
-    """A particle on a guide, stated twice, that a force of 1 N pulls; a wheel of radius 1 m rolls along."""
-
-    inertia: object = jj.parameter(1.0, unit="kg m^2", positive=True)
-    coordinates = jj.coordinates("x y turn")
-
-    def bodies(self, t, q):
-        place = jnp.stack([q.x, q.y, 0.0])
-        wheel = jj.RigidBody(0.0, self.inertia * jnp.ones(3), place, jj.rot_z(q.turn))
-        return {"load": jj.Particle(1.0, place), "wheel": wheel}
-
-    def loads(self, motion):
-        return jj.generalized_force(motion, x_rate=1.0)
-
-    def velocity_constraints(self, motion):
-        u = motion.u
-        return {"guide": u.y_rate, "guide again": u.y_rate, "rolling": u.x_rate - u.turn_rate}
-
-
-def test_rows_that_a_motion_leaves_are_warned_of():
-    options = {
-        "ts": jnp.linspace(0.0, 2.0, 11),
-        "solver": jj.ImplicitMidpoint(step=0.2),
-    }  # a step ends at each saved time
-    for kind, rows in (
-        (DoublePendulumRods, "geometric"),
-        (Snakeboard, "velocity"),
-    ):  # the velocity rows of rods are quadratic, which the rule keeps
-        kept, left = (
-            jj.simulate(kind(), formulation=jj.Formulation(stabilisation=by), **options).warnings
-            for by in ("projection", None)
-        )
-        assert [text[:5] for text in (*kept, *left[1:])] == ["T + V"] * 2
-        assert left[0].startswith(f"{rows} constraints are violated")
-
-
-def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():
-    def pulled(inertia, reduction):
-        options = {"formulation": jj.Formulation("full", reduction), "max_steps": 2000}
-        return jj.simulate(Trolley(inertia=inertia), ts=[0.0, 2.0], **options)
-
-    by_wheel = Privileged((2,))
-    for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-20, "qr")):
-        motion = pulled(inertia, reduction)
-        assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
-        assert motion.warnings == ()
-    # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its
-    # rate does not show
-    assert pulled(1e-30, "qr").result == results.MAX_STEPS
-    lost = pulled(
-        1e-30, by_wheel
-    )  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
-    assert lost.q_end[0] < 1e-3
-    assert any("hardly determine the others (pivot 1.0e-15)" in text for text in lost.warnings)
-
-
 @pytest.fixture(scope="module")
 def rolling():
     return jj.simulate(TiltingDisc(), t1=1.0, ts=jnp.linspace(0.0, 1.0, 11))
@@ -254,14 +197,6 @@ def test_options_are_a_tree_whose_numbers_may_be_traced():
     options = jj.Options(rtol=1e-6, atol=1e-6)
     assert_allclose(jax.jit(end)(options), end(options), rtol=0, atol=1e-12)
     assert len(jax.tree.leaves(jax.tree.map(jnp.asarray, options))) == 2
-
-
-def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
-    motion = jj.simulate(
-        MODELS["ball-on-turntable"]()
-    )  # ended at 4.9 of 10 s with a step size that shrank to nothing
-    assert motion.result == results.SUCCESS
-    assert motion.t_end == 10.0
 
 
 @pytest.mark.parametrize("solver", [diffrax.Bosh3(), jj.ImplicitMidpoint(step=0.01)])

@@ -7,7 +7,7 @@ import pytest
 from closed_form_runs import end_error
 from derivatives import derivatives
 from oracles import chaplygin_sleigh, skate
-from solved_states import solved_at_random_states, solved_by_every_reduction
+from solved_states import solved_by_every_reduction
 from tolerances import CLOSED_FORM, ROUND_OFF, relative_error
 
 import jourdain_jax as jj
@@ -73,17 +73,6 @@ def test_the_skate_drifts_across_the_slope_as_by_its_closed_form(moving):
         "heading_rate": run["th_rate"],
     }
     assert end_error(scene, start, skate.motion, run, "x y", heading="th") <= CLOSED_FORM
-
-
-def test_the_sleighs_blade_obeys_the_reduced_equations():
-    scene = ChaplyginSleigh(mass=0.9, inertia=0.5, offset=0.35)
-    q, u, udot, _ = solved_at_random_states(scene)
-    c, s, w = jnp.cos(q.heading), jnp.sin(q.heading), u.heading_rate
-    v, side = u.x_rate * c + u.y_rate * s, u.y_rate * c - u.x_rate * s
-    forward = udot.x_rate * c + udot.y_rate * s + w * side
-    a, k2 = scene.offset, scene.inertia / scene.mass + scene.offset**2
-    assert relative_error(forward, a * w**2) <= ROUND_OFF  # v' = a w^2
-    assert relative_error(udot.heading_rate, -(a / k2) * v * w) <= ROUND_OFF  # w' = -(a/k^2) v w
 
 
 @pytest.mark.parametrize("turn", [0.9, -0.9])

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import result_codes as results
 from numpy.testing import assert_allclose
-from oracles import skate
 from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
@@ -138,23 +137,6 @@ def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_
         lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True)
     )(1.3)
     assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
-
-
-def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_and_an_implicit_solver():
-    scene, (rates, ts) = TurnedSkate(), (np.array([0.0, 1e6]), np.linspace(0.0, 2.0, 9))
-    both = results.FULL_STATE | results.IMPLICIT
-    batch = jj.rollout(scene, TURNED | {"x": np.zeros(2)}, parameters={"damping": rates}, ts=ts, retry=True)
-    assert batch.lanes.fallback.tolist() == [results.FULL_STATE, both]
-    assert batch.continued.tolist() == [0, 1]
-    assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [
-        ("Dopri8", "full"),
-        ("RadauIIA", "full"),
-    ]
-    alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts, retry=True)
-    assert alone.raise_if_failed().fallback == both
-    expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
-    for motion in (alone, batch.lane(0), batch.lane(1)):
-        assert_allclose(motion["x"], expected, rtol=0, atol=1e-7)
 
 
 def test_steps_that_shrink_towards_a_singularity_are_named():

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from refusals import refused
 from test_inputs import OnBelt
-from test_storage import assert_equal_to_the_bit, kept
 
 import jourdain_jax as jj
 
@@ -210,19 +209,6 @@ def test_whatever_happens_to_a_byte_of_a_file_it_is_the_motion_or_named(saved, t
                 good = "new.npz" in str(error)
             assert good, (place, byte)
     assert noticed > 60
-
-
-def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
-    scene = jj.models.TiltingDisc()
-    start = {"lean": 0.3, "spin_rate": -3.0}
-    for begin, times in (
-        (start, {"t0": 1.0, "t1": 0.0}),
-        ({"lean": 0.9}, {"t1": 5.0}),  # it falls
-        (start, {"ts": [0.3, 0.3 + 1e-15, 0.7]}),
-        (start, {"ts": [0.5]}),
-    ):
-        motion = jj.simulate(scene, begin, **times)
-        assert_equal_to_the_bit(kept(motion, type(scene), tmp_path), motion)
 
 
 def changed(**parameters):

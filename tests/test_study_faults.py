@@ -119,13 +119,11 @@ def test_a_second_run_computes_nothing_whatever_clocks_say(whole, tmp_path, comp
     assert whole.complete
 
 
-@pytest.mark.parametrize("harm", ["cut short", "one bit", "gone", "receipt cut short", "of another chunk"])
+@pytest.mark.parametrize("harm", ["one bit", "gone", "receipt cut short", "of another chunk"])
 def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, path, computed):
     held = path / "lean at the end" / "c" / "1"
     content = held.read_bytes()
-    if harm == "cut short":
-        held.write_bytes(content[:-9])
-    elif harm == "one bit":
+    if harm == "one bit":
         held.write_bytes(content[:100] + bytes([content[100] ^ 4]) + content[101:])
     elif harm == "gone":
         held.unlink()
@@ -519,19 +517,17 @@ def _with_deaths(path, deadly, first_block=False):
     return deaths
 
 
-@pytest.mark.parametrize("deadly", [(1,), (2,), (1, 2)])
-def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes_on(deadly, whole, tmp_path):
+def test_chunks_on_which_processes_died_three_times_are_named_and_the_study_goes_on(whole, tmp_path):
     path = tmp_path / "discs.zarr"
-    lanes = ", ".join({1: "32 to 63", 2: "64 to 89"}[number] for number in deadly)
     with pytest.warns(
         UserWarning,
-        match=rf"processes died 3 times on samples {lanes} of .*omitted; all others are stored.*memory=",
+        match=r"died 3 times on samples 32 to 63, 64 to 89 of .*omitted; all others are stored.*memory=",
     ) as said:
-        assert _with_deaths(path, deadly) == dict.fromkeys(deadly, 3)
+        assert _with_deaths(path, (1, 2)) == {1: 3, 2: 3}
     assert len(said) == 1
     found = jj.load_study(path)
     assert not found.complete
-    assert sum(found.counts.values()) == COUNT - sum({1: 32, 2: 26}[number] for number in deadly)
+    assert sum(found.counts.values()) == 32
     assert_same(run(path), whole)  # the same call tries again
 
 

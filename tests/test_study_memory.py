@@ -1,6 +1,5 @@
 """Studies that keep to a stated amount of memory."""
 
-import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -8,8 +7,7 @@ from refusals import refused
 from test_study_faults import run, study
 
 import jourdain_jax as jj
-from jourdain_jax.studies import End, memory
-from jourdain_jax.studies.statistics import Tally
+from jourdain_jax.studies import memory
 
 pytestmark = pytest.mark.usefixtures("small_blocks")
 TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
@@ -124,15 +122,3 @@ def test_a_process_that_is_seen_beyond_the_bound_stops_and_keeps_what_is_done(tm
 def test_systems_that_do_not_say_refuse(tmp_path, monkeypatch):
     monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
     refused("limited only on Linux with glibc", run, tmp_path / "discs.zarr", memory="4GB")
-
-
-def test_lanes_are_counted_on_the_device_where_they_lie(tmp_path, monkeypatch):
-    counted, seen = Tally.of_block, []
-    monkeypatch.setattr(Tally, "of_block", lambda *given: seen.append(given) or counted(*given))
-    found = run(tmp_path / "discs.zarr", outputs={"last lean": End("lean")})
-    for *_, ends, values in seen:  # the last block is filled up by copies, which do not count
-        assert all(isinstance(x, jax.Array) and len(x) == 32 for x in (*ends.values(), values))
-    edges, (low, *within, high) = seen[0][0].edges()[0], found.statistics.counts[0]
-    lean = found.to_xarray()["last lean"].values
-    assert_array_equal(within, np.histogram(lean, edges)[0])
-    assert (low, high) == (np.sum(lean < edges[0]), np.sum(lean > edges[-1]))

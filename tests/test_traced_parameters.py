@@ -18,7 +18,6 @@ from small_scenes import OnPlane, Upright
 
 import jourdain_jax as jj
 from jourdain_jax.identification import log_density, planned_information
-from jourdain_jax.models import ChaplyginSleigh
 
 
 class TwoBlades(jj.Scene):
@@ -171,20 +170,6 @@ def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced
     slopes = jax.jit(jax.jacrev(end, (0, 1)))(0.7, 1.3)
     assert_allclose(slopes[0], slope(lambda slope: end(slope, 1.3), 0.7), atol=1e-5)
     assert_allclose(slopes[1], slope(lambda wind: end(0.7, wind), 1.3), atol=1e-5)
-
-
-def test_a_blade_under_the_mass_centre_is_flagged_where_another_offset_was_expected():
-    def turned(offset):
-        motion = jj.simulate(ChaplyginSleigh(offset=offset), {"x_rate": 0.6, "heading_rate": 0.9}, **OPTIONS)
-        return motion.q_end, motion.result
-
-    eager, code = turned(0.0)
-    assert code == results.SUCCESS
-    q, code = jax.jit(turned)(0.0)
-    if code == results.SUCCESS:
-        assert_allclose(q, eager, atol=1e-8)
-    else:
-        assert code == results.SINGULAR_PARTITION
 
 
 def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():

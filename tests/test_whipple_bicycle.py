@@ -112,14 +112,6 @@ def test_a_hands_free_ride_keeps_its_energy_and_its_contacts():
     assert jnp.max(jnp.abs(ride["lean"])) < 0.1
 
 
-def test_a_slow_bicycle_falls_and_the_ride_stops():
-    start = {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0}
-    ride = jj.simulate(BICYCLE, start, t1=5.0, rtol=1e-10, atol=1e-10)
-    assert ride.event_names[int(ride.event)] == "fallen"
-    lean_left, steer_left = 1.2 - abs(ride.q_end[LEAN]), jnp.pi / 2 - abs(ride.q_end[STEER])
-    assert abs(min(lean_left, steer_left)) <= 1e-9
-
-
 def test_parameters_come_by_name_and_only_by_name():
     values = other_bicycle()
     bicycle = WhippleBicycle.from_values(values)
