@@ -167,14 +167,13 @@ class Geared(jj.Scene):
         return {"gear": (0.5 * self.base - 1.3) * motion.u.turn_rate - motion.u.x_rate}
 
 
-@pytest.mark.parametrize("backend", ["native", "xla"])
-def test_the_only_pivot_is_a_code_where_its_terms_nearly_cancel(backend):
+def test_the_only_pivot_is_a_code_where_its_terms_nearly_cancel():
     off = np.array([0.0, 1e-12, 1e-9, -1e-7, 1e-6, 1e-4, -1e-3, 0.1])
 
     @jax.jit
     @jax.vmap
     def end(base):
-        motion = jj.simulate(Geared(base=base), {"x_rate": 1.0}, t1=1.0, backend=backend)
+        motion = jj.simulate(Geared(base=base), {"x_rate": 1.0}, t1=1.0)
         return motion.result, motion.q_end[1], 1.0 / (0.5 * base - 1.3)
 
     code, turn, rate = end(2.6 * (1 + off))

@@ -18,8 +18,6 @@ from jourdain_jax import Lowered
 from jourdain_jax.equations import coordinate_rates, unconstrained_equations
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.coordinates import parameters_of
@@ -107,12 +105,11 @@ def _check_lowered(name, scenes, states, udot, size):
         )
 
 
-def end_of_two_steps(name, *, with_start):
+def end_of_two_steps(name):
     """`x -> q, u at the end of two steps`, where x holds all parameters and the state at the start; and x.
 
     Every step is accepted, whatever its error, and the first is shorter than half of the span: so the
-    derivatives are those of the steps to round-off. `with_start`: all that `simulate` does; otherwise what it
-    does once the start is on the rows.
+    derivatives are those of the steps to round-off.
     """
     scene = MODELS[name]()
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
@@ -127,27 +124,23 @@ def end_of_two_steps(name, *, with_start):
         "events": False,
     }
 
-    known = None if with_start else set_up(scene, start, **options)
-    assert known is None or not known.reason_against_machine_code
-
     def end(x):
         parameters, q, u = unravel(x)
         own, begun = scene.replace(**parameters), eqx.tree_at(lambda s: (s.q, s.u), start, (q, u))
-        if known is None:
-            motion = jj.simulate(own, begun, **options)
-        else:
-            motion = integrate(known._replace(scene=own, start=begun))
+        motion = jj.simulate(own, begun, **options)
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     return end, np.where(flat == 0, 0.01, flat)
 
 
-def check_both_modes(name, *, with_start=False):
+@natively
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_derivatives_through_a_start_and_two_steps_are_those_of_differences_in_both_modes(name):
     """Forward mode, J d, against central differences of steps h and 2h, the leading error removed, and
     against reverse mode: w'(J d) = (J'w)'d; by the machine code that a user gets. The operations around it
     run on NumPy, in a third of the time that XLA takes to compile them.
     """
-    end, x = end_of_two_steps(name, with_start=with_start)
+    end, x = end_of_two_steps(name)
     generator = np.random.default_rng(0)
     direction = generator.normal(size=x.shape) * np.abs(x)
     forward = eval_numpy(lambda x: jax.jvp(end, (x,), (jnp.asarray(direction),)))
@@ -166,18 +159,6 @@ def check_both_modes(name, *, with_start=False):
     assert np.all(np.abs(along - better) <= left)
     apart = abs(gradient @ direction - weights @ along)
     assert apart <= ROUND_OFF * np.abs(gradient) @ np.abs(direction)
-
-
-@natively
-@pytest.mark.parametrize("name", sorted(MODELS))
-def test_derivatives_through_two_steps_are_those_of_differences_in_both_modes(name):
-    check_both_modes(name)
-
-
-@natively
-@pytest.mark.parametrize("name", sorted(MODELS))
-def test_derivatives_through_a_start_and_two_steps_are_those_of_differences_in_both_modes(name):
-    check_both_modes(name, with_start=True)
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))

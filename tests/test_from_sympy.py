@@ -3,10 +3,8 @@ scenes from other tools.
 """
 
 import functools
-import inspect
 import shutil
 import sys
-import textwrap
 
 import numpy as np
 import pytest
@@ -209,13 +207,6 @@ def test_velocity_rows_that_repeat_geometric_ones_are_left_out():
     *_, scene = made(systems.four_bar)
     t, q, u = (x[0] for x in jj.sample_states(scene, 1))
     assert constraint_rows(scene, t, q, u).names == ("configuration 1", "configuration 2")
-
-
-def test_the_example_of_the_docstring_runs(capsys):
-    made = {"jj": jj}
-    exec(textwrap.dedent(inspect.getdoc(jj.from_sympy).split("**Examples**")[1]), made)
-    assert made["Pendulum"]().inputs.entries == ()
-    assert "reached the end of its span" in capsys.readouterr().out
 
 
 def test_functions_of_many_kinds_have_values_on_jax():

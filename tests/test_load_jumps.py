@@ -106,13 +106,6 @@ def test_a_derivative_across_a_jump_warns_where_no_step_ends_there():
     assert len(warned(slope, -0.1)) == 1  # whether the jump is met is not seen
 
 
-def test_values_kinks_and_times_that_no_parameter_moves_do_not_warn():
-    f = end(JUMPS["at a place"])
-    assert not warned(f, -1.0)
-    assert not warned(jax.vmap(f), jnp.array([-1.0, -2.0]))
-    assert not warned(jax.grad(end(KINKS["a time that no parameter moves"])), -1.0)
-
-
 def test_derivatives_of_lanes_warn():
     def mean(size, backend):
         options = {"ts": [0.5], "work": False, "backend": backend}
