@@ -56,10 +56,6 @@ ARM = """
 """
 
 
-def rpy(roll, pitch, yaw):
-    return jj.rot_z(yaw) @ jj.rot_y(pitch) @ jj.rot_x(roll)
-
-
 def test_a_file_is_read_as_its_text_is(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ARM)
