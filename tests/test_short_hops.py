@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hunting.contacts import Thrown
 from numpy.testing import assert_allclose
 from test_friction import Coin
 
@@ -100,3 +101,33 @@ def test_balls_that_slide_off_a_sphere_fly_on():
     speed = np.sqrt(g * R * cos)
     assert_allclose(balls["x"][:, -1], R * sin + speed * cos * flight, rtol=1e-8)
     assert_allclose(balls["z"][:, -1], R * cos - speed * sin * flight - g * flight**2 / 2, atol=1e-7)
+
+
+class Wheel(Thrown):
+    shape = "wheel"
+
+
+def test_impacts_of_tumbling_wheels_do_not_depend_on_the_longest_step():
+    """Small impacts fall within one step of a flight, and flights that end a series of impacts are far
+    shorter than a step.
+    """
+    count, draw = 400, np.random.default_rng(2)
+    among = {
+        "i_x i_y i_z": (0.002, 0.0035),
+        "a b": (0.07, 0.15),
+        "friction": (0.05, 0.8),
+        "slope": (-0.3, 0.3),
+    }
+    among |= {"c_x": (-0.02, 0.02), "heave bounce": (0.0, 0.04)}
+    found = {name: draw.uniform(*ends, count) for names, ends in among.items() for name in names.split()}
+    found["bounce"] *= 20.0 * draw.integers(0, 2, count)
+    attitude = draw.normal(size=(count, 4))
+    start = {"attitude": attitude / np.linalg.norm(attitude, axis=1)[:, None], "z": np.full(count, 0.3)}
+    start |= {"attitude_omega": draw.uniform(-20.0, 20.0, (count, 3)), "x_rate": draw.uniform(-1, 1, count)}
+    how = {"parameters": found, "ts": [0.7], "rtol": 1e-8, "atol": 1e-8}
+    free, short = (jj.rollout(Wheel(), start, **how, max_step=x) for x in (None, 0.004))
+    for wheels in (free, short):
+        assert not np.isin(wheels.result, [2, 3]).any()
+    right = (np.asarray(free.result) == 0) & (np.asarray(short.result) == 0)
+    assert right.sum() > 390
+    assert_allclose(free["x"][right, -1], short["x"][right, -1], atol=1e-5)

@@ -202,13 +202,25 @@ def monitored(
             for values, now, kept in zip(found, armed(found), (1.0, 0.0), strict=True)
         ]
 
+    def in_the_middle() -> list[list[Number]]:
+        """Return values and rates at the middle of the cubic through states and rates at the ends."""
+        state, slope = w.room(form.y), w.room(form.y)
+
+        def put(i: int | Number) -> None:
+            a, b, slope_a, slope_b = (w.load(x, i) for x in (y, y1, *k))
+            w.store(0.5 * (a + b) + 0.125 * h * (slope_a - slope_b), state, i)
+            w.store(1.5 * (b - a) / h - 0.25 * (slope_a + slope_b), slope, i)
+
+        w.each(range(form.y), put)
+        return events(t + 0.5 * h, state, slope)
+
     at_begin, at_end = events(t, y, k[0]), events(new["t"], y1, k[1])
     begin, end = armed(at_begin), armed(at_end)
     locating = w.equal(p["code"], LOCATING)
     # most steps are far from events: for them `new` holds
     names = ["t", "h", "code", "accepted", "rejected", "event", "taken"]
     names += ["crossings", "passed", "begun"] if form.goes_on else []
-    near = locating | any_of(may_fall(w, h, *begin, *end))
+    near = locating | any_of(may_fall(w, h, *begin, *end, form.goes_on))
     if form.goes_on:
         near = near | any_of([off > 0.0 for off in p.every("disarmed")])
     kept = w.room(len(names))
@@ -220,12 +232,15 @@ def monitored(
         # a motion that starts beyond an event ends at once; a NaN state is not an event
         sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
         fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
-        share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
+        middle = with_rises(in_the_middle()) if form.goes_on else None
+        lasts = w.magnitude(h) > reach_of_noise(w, p["last_goal"])
+        share = w.where(lasts, lowest(w, h, with_rises(at_begin), middle, with_rises(at_end)), 1.0)
         sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
         returns = w.literal(0, w.truth)  # a value that may have left zero falls through it within the step
+        was_trying = search_of(form, p).trying
         if form.goes_on:
-            sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks)
-            zero = [w.smaller(c, 0.0) for c in at_begin[0]]
+            sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks, ~locating | was_trying)
+            zero = [w.number(0.0) for _ in range(count)]  # of a disarmed value, all else is round-off
             _, below = at_start(w, zero, at_begin[1], at_end[0], h, p["direction"], p["last_goal"])
             off = p.every("disarmed")
             returns = fresh & any_of([(x > 0.0) & b for x, b in zip(off, below, strict=True)])
@@ -233,13 +248,13 @@ def monitored(
             hides = fresh & any_of([w.equal(x, SLOWLY) & b for x, b in zip(off, below, strict=True)])
         sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
         sinks = [x & ~sunk_now for x in sinks]
-        again = (any_of(sinks) | returns) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
+        again = (any_of(sinks) | returns) & lasts
         dips = accept & ((share < 1.0) | again)
         share = w.where(again, ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), share)
         # the trial passed a second zero of a value that rises from zero: use a shorter step
         restarts = locating & again
         happened = accept & ~dips & ~no_event(c_1)
-        changes, was_trying = happened | (locating & ~restarts), search_of(form, p).trying
+        changes = happened | (locating & ~restarts)
         first = _follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1))
         search = search_of(form, p)
         # trials start at the last state before the event; a step over a dip of a value is repeated up to the

@@ -127,32 +127,51 @@ def is_flat(w, c_dot, slope):
     return w.magnitude(c_dot) <= FLAT * slope
 
 
-def may_fall(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values) -> list:
+def may_fall(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, near: bool) -> list:
     """Return which values may fall through zero in a step `h`. The cubic through values and rates at its ends
-    stays positive if its Bernstein coefficients are positive: c_0, c_0 + h c'_0/3, c_1 - h c'_1/3, c_1.
+    stays positive if its Bernstein coefficients are positive: c_0, c_0 + h c'_0/3, c_1 - h c'_1/3, c_1. If
+    `near`, each of them must exceed the range of all four.
     """
-    third = h / 3.0
-    return [
-        ~((a > 0.0) & (b > 0.0) & (a + third * slope_a > 0.0) & (b - third * slope_b > 0.0))
-        for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True)
-    ]
+    third, found = h / 3.0, []
+    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
+        four = a, b, a + third * slope_a, b - third * slope_b
+        margin = reduce(w.larger, four) - reduce(w.smaller, four) if near else 0.0
+        found.append(~reduce(operator.and_, [x > margin for x in four]))
+    return found
 
 
-def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
+def lowest(w, h, begin: list, middle: list | None, end: list):
     """Return the fraction of a step `h` at which the first dip below zero between its ends is lowest; 1 if
-    there is no dip. With r = sqrt(A^2 - 3 B m_0), the cubic p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at
-    s = -m_0/(A + r) = (r - A)/(3 B).
+    there is no dip. `begin`, `middle`, `end`: values and rates. With r = sqrt(A^2 - 3 B m_0), the cubic
+    p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + r) = (r - A)/(3 B).
+
+    With a `middle`, each half has a cubic. A cubic of half a step has at most about 1/16 of the error of the
+    cubic of the step, which the value in the middle shows: a minimum below that counts as a dip, too.
     """
     shares = []
-    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
-        m_0, A, B = cubic(h, a, slope_a, b, slope_b)
-        square = A * A - 3.0 * B * m_0
-        r = w.root(w.larger(square, 0.0))
-        s = w.where(A > 0.0, -m_0 / (A + r), (r - A) / (3.0 * B))
-        value = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (square > 0.0) & (s > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
-        shares.append(w.where(dips, s, 1.0))
-    return reduce(w.smaller, shares)
+    for i in range(len(begin[0])):
+        (a, slope_a), (b, slope_b) = ([x[i] for x in at] for at in (begin, end))
+        if middle is None:
+            shares.append(_lowest(w, h, a, slope_a, b, slope_b, 0.0))
+            continue
+        c, slope = (x[i] for x in middle)
+        error = w.magnitude(c - 0.5 * (a + b) - 0.125 * h * (slope_a - slope_b)) / 16.0
+        first = _lowest(w, 0.5 * h, a, slope_a, c, slope, error)
+        second = _lowest(w, 0.5 * h, c, slope, b, slope_b, error)
+        second = w.where(c > 0.0, 0.5 + 0.5 * second, 0.5)
+        shares.append(w.where(b > 0.0, w.where(first < 1.0, 0.5 * first, second), 1.0))
+    share = reduce(w.smaller, shares)
+    return w.where(share < LATE, share, 1.0)
+
+
+def _lowest(w, h, a, slope_a, b, slope_b, error):
+    m_0, A, B = cubic(h, a, slope_a, b, slope_b)
+    square = A * A - 3.0 * B * m_0
+    r = w.root(w.larger(square, 0.0))
+    s = w.where(A > 0.0, -m_0 / (A + r), (r - A) / (3.0 * B))
+    value = a + s * (m_0 + s * (A + s * B))
+    dips = (b > 0.0) & (square > 0.0) & (s > 0.0) & (s < 1.0) & (value < error - 1e-12 * (a + b))
+    return w.where(dips, s, 1.0)
 
 
 def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):

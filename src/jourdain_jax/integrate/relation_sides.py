@@ -63,11 +63,13 @@ def leaving(w: StepWriter, form: Form, p: Lanes, found: list[list[Number]]) -> l
     return [c, rate]
 
 
-def on_their_way(w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list) -> tuple[list, list]:
-    """Return `sinks` and `c_1`, corrected for values that still rise from zero at the end of a step: they do
-    not sink, and count as positive. The step may be very short, because a saved time may lie within round-off
-    of the event.
+def on_their_way(
+    w: StepWriter, c_0: list, c_1: list, sunk: list, sinks: list, forward: Number
+) -> tuple[list, list]:
+    """Return `sinks` and `c_1`, corrected for values that still rise from zero at the end of a `forward`
+    step: they do not sink, and count as positive. The step may be very short, because a saved time may lie
+    within round-off of the event.
     """
-    rising = [~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
+    rising = [forward & ~(a > 0.0) & ~below & (b > a) for a, b, below in zip(c_0, c_1, sunk, strict=True)]
     c_1 = [w.where(rises & ~(b > 0.0), 1.0, b) for b, rises in zip(c_1, rising, strict=True)]
     return [x & ~rises for x, rises in zip(sinks, rising, strict=True)], c_1

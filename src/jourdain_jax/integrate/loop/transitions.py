@@ -266,11 +266,11 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        # `slow` is for bounces only, at which the value itself does not jump
-        slow = this & found & ~side & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))
-        left_now = switches & is_left(w, c, rate, noise)
+        # an event whose value does not jump, as in an impact, leaves it at zero: all else is round-off
+        stays = this & found & ~side & w.equal(c, w.load(before, i))
+        left_now = switches & ~stays & is_left(w, c, rate, noise)
         off = w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old))
-        disarmed.append(w.where(slow, SLOWLY, off))
+        disarmed.append(w.where(stays & (rate > 0.0) & ~rises, SLOWLY, off))
     p.put("disarmed", disarmed)
     for i in range(form.modes):
         mode = w.load(modes, i)
