@@ -591,7 +591,7 @@ MUTANTS = [
         "dips not looked at",
         event_search,
         "may_fall",
-        " & (a + third * slope_a > 0.0) & (b - third * slope_b > 0.0)",
+        ", a + third * slope_a, b - third * slope_b",
         "",
         an_event_within_a_step_is_found,
         "passed over",

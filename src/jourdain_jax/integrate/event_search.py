@@ -220,7 +220,7 @@ def monitored(
     # most steps are far from events: for them `new` holds
     names = ["t", "h", "code", "accepted", "rejected", "event", "taken"]
     names += ["crossings", "passed", "begun"] if form.goes_on else []
-    near = locating | any_of(may_fall(w, h, *begin, *end, form.goes_on))
+    near = locating | any_of(may_fall(w, h, form.goes_on, *begin, *end))
     if form.goes_on:
         near = near | any_of([off > 0.0 for off in p.every("disarmed")])
     kept = w.room(len(names))

@@ -127,7 +127,7 @@ def is_flat(w, c_dot, slope):
     return w.magnitude(c_dot) <= FLAT * slope
 
 
-def may_fall(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, near: bool) -> list:
+def may_fall(w, h, near: bool, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values) -> list:
     """Return which values may fall through zero in a step `h`. The cubic through values and rates at its ends
     stays positive if its Bernstein coefficients are positive: c_0, c_0 + h c'_0/3, c_1 - h c'_1/3, c_1. If
     `near`, each of them must exceed the range of all four.
