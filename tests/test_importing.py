@@ -89,7 +89,13 @@ jnp.zeros(3)
 jj.Scene
 assert dict(os.environ) == before
 """
+BY_PACKAGE = """
+import os
+from jourdain_jax.bicycle import stability_speeds
+assert int(os.environ["PJRT_NPROC"]) >= 16
+"""
 PROGRAMS = {
+    "a package on its own": BY_PACKAGE,
     "computes nothing, and imports what a motion needs": PROGRAM,
     "configured": CONFIGURED,
     "after JAX has started": STARTED,

@@ -2,8 +2,8 @@
 virtual power.
 
 Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is 0, and
-changes nothing else. The first use of a public name then calls `configure` with its defaults, if JAX has not
-computed anything yet.
+changes nothing else. The first use of a public name or package that computes then calls `configure` with its
+defaults, if JAX has not computed anything yet.
 
 Public names are imported on first use; `__init__.pyi` lists them.
 """
@@ -16,7 +16,6 @@ import lazy_loader as _lazy_loader
 if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
 
-from jourdain_jax.calculus.configuration import configure_by_default as _configure_by_default
 from jourdain_jax.calculus.lazy_imports import module_on_first_use as _module_on_first_use
 from jourdain_jax.calculus.lazy_imports import version_of as _version_of
 from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
@@ -35,8 +34,6 @@ _MOVED = ("identification", "studies", "equations", "analysis")
 def __getattr__(name: str) -> object:
     """Import a public name. Raise an AttributeError for other names, with the new place of a former name."""
     if name in __all__:
-        if name != "configure":
-            _configure_by_default()
         return _public(name)
     places = [
         f"it is `jj.{place}.{name}`" for place in _MOVED if name[:1] != "_" and name in _public(place).__all__

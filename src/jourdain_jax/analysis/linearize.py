@@ -219,7 +219,7 @@ class Linearization(Printed, eqx.Module):
                 "no coordinates are named, so there is no second-order form; give `coordinates` to "
                 "`linearize`, or use `state_eigenvalues`"
             )
-        return companion(self.M, self.C, self.K)
+        return companion(-jnp.linalg.solve(self.M, jnp.concatenate([self.K, self.C], axis=1)))
 
 
 @shown_from_users_lines
@@ -325,9 +325,9 @@ def _about(
     )
 
 
-def companion(M, C, K) -> Float[Array, "modes modes"]:
-    """Return the matrix of the first-order form `d(p, pdot)/dt` of `M pddot + C pdot + K p = 0`."""
-    lower, k = -jnp.linalg.solve(M, jnp.concatenate([K, C], axis=1)), len(M)
+def companion(lower: Float[Array, "k modes"]) -> Float[Array, "modes modes"]:
+    """Return the matrix of the first-order form `d(p, pdot)/dt` of `pddot = lower (p, pdot)`."""
+    k = len(lower)
     return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
 
 

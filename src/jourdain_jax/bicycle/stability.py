@@ -1,16 +1,16 @@
 """Eigenvalues of the linear bicycle, and the speeds at which its stability changes.
 
     M q'' + v C1 q' + (g K0 + v^2 K2) q = 0,   q = (lean, steer)
-    p(s; v) = det(s^2 M + s v C1 + g K0 + v^2 K2) = a4 s^4 + a3 s^3 + a2 s^2 + a1 s + a0
+    p(s; v) = det(s^2 + M^-1 (s v C1 + g K0 + v^2 K2)) = s^4 + a3 s^3 + a2 s^2 + a1 s + a0
 
-With x = v^2, the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x). Stability changes
-at roots of polynomials in x (omega^2 = b1/b3):
+With x = v^2, the coefficients are a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x). Stability changes at roots
+of polynomials in x (omega^2 = b1/b3):
 
     where an eigenvalue is zero             b0 = 0
-    where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if b1/b3 > 0)
+    where two eigenvalues sum to zero       b1 b2 b3 - b1^2 - b0 b3^2 = 0     (+-i omega if b1/b3 > 0)
     where two eigenvalues coincide          4 D0^3 - D1^2 = 0, with
-        D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
-        D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
+        D0 = b2^2 - 3 x b3 b1 + 12 b0,
+        D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b1^2 - 72 b2 b0
 
 All positive roots are found and refined by Newton's method, whose last steps also give derivatives. Counts
 of growing modes between neighbouring roots show what changes at a root. Coefficients are ordered from the
@@ -52,6 +52,7 @@ _SPEED = 4.0  # physics, m/s: of the second linearisation
 _DEPENDENT = ("pitch",)
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]
+UnitMass = tuple[Square, Square, Square, Scalar]  # C1, K0, K2 multiplied by M^-1, and g
 Polynomial = Float[Array, " coefficients"]
 
 
@@ -114,16 +115,16 @@ def eigenvalues(
     eigenvalues). If real eigenvalues lie on both sides of a complex pair, the lower one is castering, the
     higher one capsize, and the pair is weave. The eigenvalue of a pair with negative frequency comes first.
     """
-    matrices = _as_matrices(M, C1, K0, K2, g)
-    values = jax.vmap(lambda v: _eigenvalues(matrices, v))(jnp.asarray(speeds, matrices.g.dtype))
+    matrices = _of_unit_mass(M, C1, K0, K2, g)
+    values = jax.vmap(lambda v: _eigenvalues(matrices, v))(jnp.asarray(speeds, real_type()))
     lowest, low, high, highest = (values.imag != 0).T
     pair_between = low & high & ~lowest & ~highest
     return jnp.where(pair_between[:, None], values[:, np.array([0, 3, 1, 2])], values)
 
 
-def _eigenvalues(matrices: BicycleMatrices, v: Scalar) -> Complex[Array, " 4"]:
-    M, C1, K0, K2, g = matrices
-    return sorted_eigenvalues(companion(M, v * C1, g * K0 + v**2 * K2))
+def _eigenvalues(matrices: UnitMass, v: Scalar) -> Complex[Array, " 4"]:
+    C1, K0, K2, g = matrices
+    return sorted_eigenvalues(companion(-jnp.concatenate([g * K0 + v**2 * K2, v * C1], axis=1)))
 
 
 def stability_speeds(
@@ -142,50 +143,52 @@ def stability_speeds(
     largest speed (m/s) examined. **Returns:** a `StabilitySpeeds`. Derivatives follow from the implicit
     function theorem; a speed that does not exist is NaN with derivative zero.
     """
-    matrices = _as_matrices(M, C1, K0, K2, g)
-    return _speeds(matrices, jax.lax.stop_gradient(jnp.asarray(max_speed, matrices.M.dtype)))
+    matrices = _of_unit_mass(M, C1, K0, K2, g)
+    return _speeds(matrices, jax.lax.stop_gradient(jnp.asarray(max_speed, real_type())))
 
 
 @compiled_quickly
-def _speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
-    found = [_roots(polynomial, top**2) for polynomial in _in_speed(matrices)]
-    x, there = map(jnp.concatenate, zip(*found, strict=True))
-    v, kind = jnp.sqrt(jnp.where(there, x, top**2)), np.repeat(range(3), [len(x) for x, _ in found])
+def _speeds(matrices: UnitMass, top: Scalar) -> StabilitySpeeds:
+    # roots in one call, eigenvalues in one, and each step needs the one before: with jaxlib 0.10, two batches
+    # that LAPACK decomposes at a time wait for each other forever on a machine with two cores
+    x, there = (found.ravel() for found in jax.vmap(_roots, (0, None))(_in_speed(matrices), top**2))
+    v, kind = jnp.sqrt(jnp.where(there, x, top**2)), np.repeat(range(3), len(x) // 3)
 
+    @jax.vmap
     def between(v):
         """Return the ends of the intervals between speeds, and the eigenvalues within each interval."""
-        ends = jnp.sort(jnp.hstack([0.0, jax.lax.stop_gradient(v), top]))
+        ends = jnp.sort(jnp.hstack([0.0, jax.lax.stop_gradient(v), top]))[:12]  # at most ten speeds
         at = lambda v: _eigenvalues(jax.lax.stop_gradient(matrices), v)
         return ends, jax.vmap(at)((ends[:-1] + ends[1:]) / 2)
 
-    ends, values = between(v)
+    (ends, of_range), (values, in_range) = between(jnp.stack([v, jnp.where(kind < 2, v, top)]))
     more_reals, more_pairs = (
         jnp.diff(jnp.sum((values.real > 0) & of_kind, axis=1))[jnp.searchsorted(ends, v) - 1]
         for of_kind in (values.imag == 0, values.imag != 0)
     )
     only = lambda some: jnp.where(there & some, v, jnp.nan)
     weave = jnp.nanmax(only((kind == 1) & (more_pairs < 0)))
-    ends, values = between(jnp.where(kind < 2, v, top))
-    widths = jnp.where(jnp.all(values.real < -1e-9, axis=1), jnp.diff(ends), 0.0)
+    widths = jnp.where(jnp.all(in_range.real < -1e-9, axis=1), jnp.diff(of_range), 0.0)
     k, exists = jnp.argmax(widths), jnp.max(widths) > 0
     return StabilitySpeeds(
         weave_speed=weave,
         capsize_speed=jnp.nanmin(only((kind == 0) & (more_reals > 0))),
         double_root_speed=jnp.nanmax(only((kind == 2) & (more_pairs > 0) & ~(v >= weave))),
-        stable_from=jnp.where(exists, ends[k], jnp.nan),
-        stable_to=jnp.where(exists, ends[k + 1], jnp.nan),
+        stable_from=jnp.where(exists, of_range[k], jnp.nan),
+        stable_to=jnp.where(exists, of_range[k + 1], jnp.nan),
         stable_range_exists=exists,
     )
 
 
-def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
-    """Return the matrices as arrays."""
-    return BicycleMatrices(*(jnp.asarray(value, real_type()) for value in (M, C1, K0, K2, g)))
+def _of_unit_mass(M, C1, K0, K2, g) -> UnitMass:
+    """Return C1, K0 and K2, multiplied by `M^-1`, and g as arrays."""
+    M, *others, g = (jnp.asarray(value, real_type()) for value in (M, C1, K0, K2, g))
+    return *jnp.split(jnp.linalg.solve(M, jnp.concatenate(others, axis=1)), 3, axis=1), g
 
 
-def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Return three polynomials in x (defined in the module docstring). They are zero if an eigenvalue is
-    zero, if two eigenvalues sum to zero, and if two coincide.
+def _in_speed(matrices: UnitMass) -> Float[Array, "3 coefficients"]:
+    """Return three polynomials in x (defined in the module docstring), padded to one length. They are zero if
+    an eigenvalue is zero, if two eigenvalues sum to zero, and if two coincide.
     """
     one, x = np.eye(2, 7)
     # not `jnp.polymul`: its batch is a convolution with a group for each sample, and on CPUs the work for it
@@ -197,15 +200,15 @@ def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
         of = lambda i, j, k, l: times(A[i, j], B[k, l])
         return of(0, 0, 1, 1) + of(1, 1, 0, 0) - of(0, 1, 1, 0) - of(1, 0, 0, 1)
 
-    M, C1, K0, K2 = (A[..., None] for A in matrices[:4])
-    M, C, K = M * one, C1 * one, matrices.g * K0 * one + K2 * x
-    b4, b3, b1, b0 = mixed(M, M) / 2, mixed(M, C), mixed(C, K), mixed(K, K) / 2
-    b2 = mixed(M, K) + times(x, mixed(C, C)) / 2
-    opposite = times(b1, b2, b3) - times(b4, b1, b1) - times(b0, b3, b3)
-    D0 = times(b2, b2) - 3 * times(x, b3, b1) + 12 * times(b4, b0)
-    D1 = 2 * times(b2, b2, b2) - 9 * times(x, b3, b2, b1) - 72 * times(b4, b2, b0)
-    D1 = D1 + 27 * times(x, times(b3, b3, b0) + times(b4, b1, b1))
-    return b0[:3], opposite[:3], 4 * times(D0, D0, D0) - times(D1, D1)
+    C1, K0, K2, g = (A[..., None] for A in matrices)
+    C, K = C1 * one, g * K0 * one + K2 * x
+    b3, b1, b0 = jnp.trace(C), mixed(C, K), mixed(K, K) / 2
+    b2 = jnp.trace(K) + times(x, mixed(C, C)) / 2
+    opposite = times(b1, b2, b3) - times(b1, b1) - times(b0, b3, b3)
+    D0 = times(b2, b2) - 3 * times(x, b3, b1) + 12 * b0
+    D1 = 2 * times(b2, b2, b2) - 9 * times(x, b3, b2, b1) - 72 * times(b2, b0)
+    D1 += 27 * times(x, times(b3, b3, b0) + times(b1, b1))
+    return jnp.stack([b0, opposite, 4 * times(D0, D0, D0) - times(D1, D1)])
 
 
 def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:

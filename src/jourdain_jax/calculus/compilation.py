@@ -14,8 +14,11 @@ import jax
 import jax.extend.core
 import jaxlib.version
 
+from jourdain_jax.calculus.configuration import configure_by_default
 from jourdain_jax.calculus.progress import announced
 from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
+
+configure_by_default()  # every module that computes imports this one
 
 F = TypeVar("F", bound=Callable)
 

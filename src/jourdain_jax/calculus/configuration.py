@@ -24,7 +24,8 @@ def configure(*, threads: int | None = None, xla_threads: int | None = None) -> 
     """Set what JAX and the machine code read from the environment, and return these variables by name.
 
     Call it before the first computation of JAX. Without such a call, the first use of any other public name
-    applies the defaults, if JAX has not computed anything yet. Variables that are set already are kept.
+    or package applies the defaults, if JAX has not computed anything yet. Variables that are set already are
+    kept.
 
         jj.configure(threads=8)  # the first line after `import jourdain_jax as jj`
 

@@ -20,6 +20,7 @@ from jourdain_jax.scene.coordinates import nearest
 from jourdain_jax.studies.records import InUseError
 
 OK, FAILED, USAGE = 0, 1, 2  # code
+QUICKLY = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")
 
 
@@ -47,16 +48,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         gc.freeze()
         gc.set_threshold(50_000, 20, 20)
+        # cheaper compilation for programs that run once; other versions of jaxlib may not know the flags
+        if jaxlib.__version__.startswith("0.10."):
+            os.environ["XLA_FLAGS"] = f"{QUICKLY} {os.environ['XLA_FLAGS']}"
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in VERBS:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
         return USAGE
     options = parser().parse_args(arguments)
-    # cheaper compilation for programs that run once; other versions of jaxlib may not know the flags
-    if jaxlib.__version__.startswith("0.10."):
-        os.environ.setdefault(
-            "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-        )
     try:
         return OK if options.run(options) else FAILED
     except (ValueError, InUseError, ImportError) as error:

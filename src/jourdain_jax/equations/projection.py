@@ -95,14 +95,11 @@ def _solved(A, r, M, free, typical, cutoff) -> _Solved:
     d = row_scale(W, typical)
     P = pseudo_inverse(d[:, None] * W, cutoff)
     y = P @ (d * r)
-    x, K = (
-        (c * y, c[:, None] * P * d) if L is None else (c * _backward(L, y), c[:, None] * _backward(L, P * d))
-    )
-    return _Solved(Change(x, K), d * (P.T @ y), d, c, L, definite)
-
-
-def _backward(L, y):
-    return jax.scipy.linalg.solve_triangular(L.T, y, lower=False)
+    both = jnp.column_stack([y, P * d])
+    if L is not None:
+        both = jax.scipy.linalg.solve_triangular(L.T, both)
+    both *= c[:, None]
+    return _Solved(Change(both[:, 0], both[:, 1:]), d * (P.T @ y), d, c, L, definite)
 
 
 @eqx.filter_custom_jvp

@@ -327,8 +327,9 @@ class UdwadiaKalaba(Reduction):
 
     def solve(self, problem):
         L, definite = cholesky(problem.M)
-        free = jax.scipy.linalg.solve_triangular(L, problem.f, lower=True)  # L' a
-        weighted = jax.scipy.linalg.solve_triangular(L, problem.A.T, lower=True).T  # A L'^-1
+        both = jnp.column_stack([problem.f, problem.A.T])
+        both = jax.scipy.linalg.solve_triangular(L, both, lower=True).T
+        free, weighted = both[0], both[1:]  # L' a and A L'^-1
         # rescale to the lengths in A, so that a vanishing row stays small
         lengths, by_mass = (
             jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, axis=1)) for rows in (problem.A, weighted)
