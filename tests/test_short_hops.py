@@ -107,11 +107,9 @@ class Wheel(Thrown):
     shape = "wheel"
 
 
-def test_impacts_of_tumbling_wheels_do_not_depend_on_the_longest_step():
-    """Small impacts fall within one step of a flight, and flights that end a series of impacts are far
-    shorter than a step.
-    """
-    count, draw = 400, np.random.default_rng(2)
+def _wheels(seed):
+    """Parameters and starts of 400 wheels."""
+    count, draw = 400, np.random.default_rng(seed)
     among = {
         "i_x i_y i_z": (0.002, 0.0035),
         "a b": (0.07, 0.15),
@@ -124,10 +122,21 @@ def test_impacts_of_tumbling_wheels_do_not_depend_on_the_longest_step():
     attitude = draw.normal(size=(count, 4))
     start = {"attitude": attitude / np.linalg.norm(attitude, axis=1)[:, None], "z": np.full(count, 0.3)}
     start |= {"attitude_omega": draw.uniform(-20.0, 20.0, (count, 3)), "x_rate": draw.uniform(-1, 1, count)}
+    return found, start
+
+
+def test_impacts_of_tumbling_wheels_do_not_depend_on_the_longest_step():
+    """Small impacts fall within one step of a flight, and flights that end a series of impacts are far
+    shorter than a step, or too low to be told from round-off.
+    """
+    found, start = (
+        {name: np.concatenate([drawn[name] for drawn in parts]) for name in parts[0]}
+        for parts in zip(*map(_wheels, (2, 3, 4)), strict=True)
+    )
     how = {"parameters": found, "ts": [0.7], "rtol": 1e-8, "atol": 1e-8}
     free, short = (jj.rollout(Wheel(), start, **how, max_step=x) for x in (None, 0.004))
     for wheels in (free, short):
         assert not np.isin(wheels.result, [2, 3]).any()
     right = (np.asarray(free.result) == 0) & (np.asarray(short.result) == 0)
-    assert right.sum() > 390
+    assert right.sum() > 1170
     assert_allclose(free["x"][right, -1], short["x"][right, -1], atol=1e-5)

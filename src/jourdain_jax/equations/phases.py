@@ -212,7 +212,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     bounces = strikes & (numbers == FLIES) & (at.w[:, 0] < -w[:, 0])
     falls = -(then.found.G @ rest.P.ravel() + then.found.b)[::3]
     share = 1 + w[:, 0] / jnp.where(bounces, at.w[:, 0], 1.0)
-    steady = jnp.abs(at.w[:, 0] + at.slots[:, 0]) <= STEADY * w[:, 0]
+    steady = jnp.abs(at.w[:, 0] + at.slots[:, 0]) <= STEADY * at.slots[:, 0]
     settles = bounces & steady & (falls > 0) & (2 * w[:, 0] ** 2 <= SETTLES * falls * share**2)
     rests = motion.t + 2 * w[:, 0] / jnp.where(settles, falls * share, 1.0)
     waits = jnp.where(((at.number == FLIES) & ~hits)[:, None], at.slots, 0.0)

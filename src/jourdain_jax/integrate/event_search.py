@@ -222,7 +222,7 @@ def monitored(
     names += ["crossings", "passed", "begun"] if form.goes_on else []
     near = locating | any_of(may_fall(w, h, form.goes_on, *begin, *end))
     if form.goes_on:
-        near = near | any_of([off > 0.0 for off in p.every("disarmed")])
+        near = near | any_of(off > 0.0 for off in p.every("disarmed"))
     kept = w.room(len(names))
     for i, name in enumerate(names):
         w.store(new[name] if name in new else p[name], kept, i)
@@ -240,12 +240,10 @@ def monitored(
         was_trying = search_of(form, p).trying
         if form.goes_on:
             sinks, c_1 = on_their_way(w, c_0, c_1, sunk, sinks, ~locating | was_trying)
-            zero = [w.number(0.0) for _ in range(count)]  # of a disarmed value, all else is round-off
+            zero = [w.number(0.0)] * count  # of a disarmed value, all else is round-off
             _, below = at_start(w, zero, at_begin[1], at_end[0], h, p["direction"], p["last_goal"])
             off = p.every("disarmed")
-            returns = fresh & any_of([(x > 0.0) & b for x, b in zip(off, below, strict=True)])
-            # however short the step, the value falls back
-            hides = fresh & any_of([w.equal(x, SLOWLY) & b for x, b in zip(off, below, strict=True)])
+            returns = fresh & any_of((x > 0.0) & b for x, b in zip(off, below, strict=True))
         sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
         sinks = [x & ~sunk_now for x in sinks]
         again = (any_of(sinks) | returns) & lasts
@@ -301,13 +299,7 @@ def monitored(
             p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
             noise = reach_of_noise(w, p["last_goal"])
             left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
-            p.put(
-                "disarmed",
-                [
-                    w.where(has_left, 0.0, off)
-                    for has_left, off in zip(left, p.every("disarmed"), strict=True)
-                ],
-            )
+            p.put("disarmed", [w.where(gone, 0.0, x) for gone, x in zip(left, off, strict=True)])
             rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
             side = is_side(w, form, changed["event"])  # numbers of several relations may vanish together
             flat = ~side & (over | is_flat(w, rate, slope))
@@ -324,8 +316,12 @@ def monitored(
             changed["crossings"] = p["crossings"] + w.where(goes & side, 1.0, 0.0)
             # crossings count as trial steps, which limits their number
             changed["rejected"] += w.where(goes & side & over, 1.0, 0.0)
-            hides = hides & accept & ~dips
-            changed["code"] = w.where(hides, float(result_codes.ZENO), changed["code"])
+            # the value falls back before it has left zero beyond round-off
+            hides = any_of(
+                w.equal(x, SLOWLY) & ~gone & ~(slope * p["direction"] > 0.0)
+                for x, gone, slope in zip(off, left, at_end[1], strict=True)
+            )
+            changed["code"] = w.where(hides & accept & ~dips, float(result_codes.ZENO), changed["code"])
             changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"], p["begun"])}
             changed["event"] = w.where(goes, -1.0, changed["event"])
         if form.moving:

@@ -299,7 +299,7 @@ def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Numbe
 
 def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
     """Return whether any constraint nearly depends on earlier ones: the sine between them is below 0.1."""
-    return any_of([left < 0.1**2 * size for left, size in squares])
+    return any_of(left < 0.1**2 * size for left, size in squares)
 
 
 def put_near_rows(w: StepWriter, form: Form, state: Number, near: Number, t: Number, y: Number) -> None:
