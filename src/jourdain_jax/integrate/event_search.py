@@ -41,6 +41,7 @@ from jourdain_jax.integrate.event_values import (
     any_of,
     at_start,
     chosen,
+    cubic,
     falls_through,
     first_event,
     is_flat,
@@ -50,6 +51,7 @@ from jourdain_jax.integrate.event_values import (
     no_event,
     reach_of_noise,
     trial,
+    until_back,
 )
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, Number, StepWriter, each_row
@@ -202,17 +204,20 @@ def monitored(
             for values, now, kept in zip(found, armed(found), (1.0, 0.0), strict=True)
         ]
 
-    def in_the_middle() -> list[list[Number]]:
-        """Return values and rates at the middle of the cubic through states and rates at the ends."""
+    def between(share: float) -> list[list[Number]]:
+        """Return values and rates at a `share` of the step, by the cubic of states and rates at its ends."""
         state, slope = w.room(form.y), w.room(form.y)
 
         def put(i: int | Number) -> None:
             a, b, slope_a, slope_b = (w.load(x, i) for x in (y, y1, *k))
-            w.store(0.5 * (a + b) + 0.125 * h * (slope_a - slope_b), state, i)
-            w.store(1.5 * (b - a) / h - 0.25 * (slope_a + slope_b), slope, i)
+            m, A, B = cubic(h, a, slope_a, b, slope_b)
+            w.store(a + share * (m + share * (A + share * B)), state, i)
+            w.store((m + share * (2.0 * A + 3.0 * share * B)) / h, slope, i)
 
         w.each(range(form.y), put)
-        return events(t + 0.5 * h, state, slope)
+        if form.projects:  # a quaternion of another length is no attitude
+            w.run("project", p.pointer, t + share * h, state)
+        return events(t + share * h, state, slope)
 
     at_begin, at_end = events(t, y, k[0]), events(new["t"], y1, k[1])
     begin, end = armed(at_begin), armed(at_end)
@@ -232,9 +237,20 @@ def monitored(
         # a motion that starts beyond an event ends at once; a NaN state is not an event
         sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
         fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
-        middle = with_rises(in_the_middle()) if form.goes_on else None
-        lasts = w.magnitude(h) > reach_of_noise(w, p["last_goal"])
-        share = w.where(lasts, lowest(w, h, with_rises(at_begin), middle, with_rises(at_end)), 1.0)
+        lasts, dip = w.magnitude(h) > reach_of_noise(w, p["last_goal"]), w.room()
+        w.store(1.0, dip)
+
+        def seek_dips() -> None:
+            middle = with_rises(between(0.5)) if form.goes_on else None
+            share = lowest(w, h, with_rises(at_begin), middle, with_rises(at_end))
+            if form.goes_on:
+                soon, noise = between(2.0**-10)[1], reach_of_noise(w, p["last_goal"])
+                back = until_back(w, h, p["direction"], noise, at_begin, soon, at_end[0])
+                share = w.smaller(share, w.where(fresh, back, 1.0))
+            w.store(w.where(lasts, share, 1.0), dip)
+
+        w.if_any(accept, seek_dips)
+        share = w.load(dip)
         sunk, sinks = at_start(w, c_0, rate_0, c_1, h, p["direction"], p["last_goal"])
         returns = w.literal(0, w.truth)  # a value that may have left zero falls through it within the step
         was_trying = search_of(form, p).trying

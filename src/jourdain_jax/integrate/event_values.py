@@ -145,8 +145,9 @@ def lowest(w, h, begin: list, middle: list | None, end: list):
     there is no dip. `begin`, `middle`, `end`: values and rates. With r = sqrt(A^2 - 3 B m_0), the cubic
     p(s) = c_0 + m_0 s + A s^2 + B s^3 is lowest at s = -m_0/(A + r) = (r - A)/(3 B).
 
-    With a `middle`, each half has a cubic. A cubic of half a step has at most about 1/16 of the error of the
-    cubic of the step, which the value in the middle shows: a minimum below that counts as a dip, too.
+    With a `middle`, each half has a cubic. The value in the middle shows the error of the cubic of the step:
+    a minimum of a half below a quarter of that counts as a dip, too, and so does a point of inflection
+    (r = 0) where the cubic has no minimum.
     """
     shares = []
     for i in range(len(begin[0])):
@@ -155,7 +156,7 @@ def lowest(w, h, begin: list, middle: list | None, end: list):
             shares.append(_lowest(w, h, a, slope_a, b, slope_b, 0.0))
             continue
         c, slope = (x[i] for x in middle)
-        error = w.magnitude(c - 0.5 * (a + b) - 0.125 * h * (slope_a - slope_b)) / 16.0
+        error = w.magnitude(c - 0.5 * (a + b) - 0.125 * h * (slope_a - slope_b)) / 4.0
         first = _lowest(w, 0.5 * h, a, slope_a, c, slope, error)
         second = _lowest(w, 0.5 * h, c, slope, b, slope_b, error)
         second = w.where(c > 0.0, 0.5 + 0.5 * second, 0.5)
@@ -164,13 +165,27 @@ def lowest(w, h, begin: list, middle: list | None, end: list):
     return w.where(share < LATE, share, 1.0)
 
 
+def until_back(w, h, direction, noise, begin: list, soon: Values, c_1: Values):
+    """Return half of the share of a step `h` after which a value that rises from zero is zero again if its
+    rate goes on to fall as it does at first; 1 if that is after the step. `begin`: values and rates; `soon`:
+    rates after 2^-10 of the step.
+    """
+    found = w.number(1.0)
+    for c, rate, later, end in zip(*begin, soon, c_1, strict=True):
+        rises, falls = rate * direction, (rate - later) * direction
+        share = rises / (1024.0 * falls)
+        back = (rises > 0.0) & ~(c > noise * rises) & (512.0 * falls > rises) & (end > 0.0)
+        back = back & (share * w.magnitude(h) > noise)  # otherwise the rate is round-off
+        found = w.where(back, w.smaller(found, share), found)
+    return found
+
+
 def _lowest(w, h, a, slope_a, b, slope_b, error):
     m_0, A, B = cubic(h, a, slope_a, b, slope_b)
-    square = A * A - 3.0 * B * m_0
-    r = w.root(w.larger(square, 0.0))
+    r = w.root(w.larger(A * A - 3.0 * B * m_0, 0.0))
     s = w.where(A > 0.0, -m_0 / (A + r), (r - A) / (3.0 * B))
     value = a + s * (m_0 + s * (A + s * B))
-    dips = (b > 0.0) & (square > 0.0) & (s > 0.0) & (s < 1.0) & (value < error - 1e-12 * (a + b))
+    dips = (b > 0.0) & (s > 0.0) & (s < 1.0) & (value < error - 1e-12 * (a + b))
     return w.where(dips, s, 1.0)
 
 
