@@ -186,14 +186,15 @@ def monitored(
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
         """Reverse the sign of values that have not left zero since their event. A value that rises and falls
         again within one step is then found as a new event. Values that are positive by round-off after an
-        event do not dip: near a triple zero, as after a lift-off, the cubic dips by its own error.
+        event, or at the start, do not dip: near a triple zero, as after a lift-off, the cubic dips by its own
+        error.
         """
         if not form.goes_on:
             return found
         off, noise = p.every("disarmed"), reach_of_noise(w, p["last_goal"])
-        follows = w.equal(p["accepted"], p["begun"]) & (p["passed"] > 0.0)
+        begins = w.equal(p["accepted"], p["begun"])
         level = [
-            follows & is_level(w, a, slope, b, h, noise)
+            begins & is_level(w, a, slope, b, h, noise)
             for a, slope, b in zip(*at_begin, at_end[0], strict=True)
         ]
         return [
