@@ -502,7 +502,7 @@ speeds_of = jax.jit(stability_speeds)
 
 
 def test_decompositions_of_a_batch_wait_for_each_other():
-    """With jaxlib 0.10, two batches that LAPACK decomposes at a time wait forever on two cores."""
+    """With jaxlib 0.10, two batched LAPACK calls that run at the same time can wait forever on two cores."""
     program = jax.jit(jax.vmap(stability_speeds)).lower(*(jnp.ones((9, 2, 2)),) * 4, jnp.ones(9))
     before, calls = {}, []
     for name, value in re.findall(r"^  (?:ROOT )?%?([\w.-]+) = (.*)", program.compile().as_text(), re.M):

@@ -149,15 +149,15 @@ def stability_speeds(
 
 @compiled_quickly
 def _speeds(matrices: UnitMass, top: Scalar) -> StabilitySpeeds:
-    # roots in one call, eigenvalues in one, and each step needs the one before: with jaxlib 0.10, two batches
-    # that LAPACK decomposes at a time wait for each other forever on a machine with two cores
+    # one call for all roots, then one for all eigenvalues: with jaxlib 0.10, two batched LAPACK calls at the
+    # same time can wait for each other forever on two threads
     x, there = (found.ravel() for found in jax.vmap(_roots, (0, None))(_in_speed(matrices), top**2))
     v, kind = jnp.sqrt(jnp.where(there, x, top**2)), np.repeat(range(3), len(x) // 3)
 
     @jax.vmap
     def between(v):
         """Return the ends of the intervals between speeds, and the eigenvalues within each interval."""
-        ends = jnp.sort(jnp.hstack([0.0, jax.lax.stop_gradient(v), top]))[:12]  # at most ten speeds
+        ends = jnp.sort(jnp.hstack([0.0, jax.lax.stop_gradient(v), top]))[:12]  # 0, at most ten speeds, top
         at = lambda v: _eigenvalues(jax.lax.stop_gradient(matrices), v)
         return ends, jax.vmap(at)((ends[:-1] + ends[1:]) / 2)
 

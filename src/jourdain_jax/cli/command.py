@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(50_000, 20, 20)
         # cheaper compilation for programs that run once; other versions of jaxlib may not know the flags
         if jaxlib.__version__.startswith("0.10."):
-            os.environ["XLA_FLAGS"] = f"{QUICKLY} {os.environ['XLA_FLAGS']}"
+            os.environ["XLA_FLAGS"] = f"{QUICKLY} {os.environ.get('XLA_FLAGS', '')}"
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in VERBS:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)

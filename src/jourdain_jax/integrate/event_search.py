@@ -183,28 +183,6 @@ def monitored(
             for part, value in zip(found, (1.0, 0.0), strict=True)
         ]
 
-    def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Reverse the sign of values that have not left zero since their event. A value that rises and falls
-        again within one step is then found as a new event. Values that are positive by round-off after an
-        event, or at the start, do not dip: near a triple zero, as after a lift-off, the cubic dips by its own
-        error.
-        """
-        if not form.goes_on:
-            return found
-        off, noise = p.every("disarmed"), reach_of_noise(w, p["last_goal"])
-        begins = w.equal(p["accepted"], p["begun"])
-        level = [
-            begins & is_level(w, a, slope, b, h, noise)
-            for a, slope, b in zip(*at_begin, at_end[0], strict=True)
-        ]
-        return [
-            [
-                w.where(x > 0.0, -c, w.where(rests, kept, c_armed))
-                for x, c, rests, c_armed in zip(off, values, level, now, strict=True)
-            ]
-            for values, now, kept in zip(found, armed(found), (1.0, 0.0), strict=True)
-        ]
-
     def between(share: float) -> list[list[Number]]:
         """Return values and rates at a `share` of the step, by the cubic of states and rates at its ends."""
         state, slope = w.room(form.y), w.room(form.y)
@@ -216,7 +194,7 @@ def monitored(
             w.store((m + share * (2.0 * A + 3.0 * share * B)) / h, slope, i)
 
         w.each(range(form.y), put)
-        if form.projects:  # a quaternion of another length is no attitude
+        if form.projects:  # quaternions on the cubic are shorter than one
             w.run("project", p.pointer, t + share * h, state)
         return events(t + share * h, state, slope)
 
@@ -238,16 +216,39 @@ def monitored(
         # a motion that starts beyond an event ends at once; a NaN state is not an event
         sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
         fresh = w.equal(p["accepted"], p["begun"] if form.goes_on else 0.0) & ~locating & sound
-        lasts, dip = w.magnitude(h) > reach_of_noise(w, p["last_goal"]), w.room()
+        noise, dip = reach_of_noise(w, p["last_goal"]), w.room()
+        lasts = w.magnitude(h) > noise
         w.store(1.0, dip)
 
         def seek_dips() -> None:
-            middle = with_rises(between(0.5)) if form.goes_on else None
-            share = lowest(w, h, with_rises(at_begin), middle, with_rises(at_end))
             if form.goes_on:
-                soon, noise = between(2.0**-10)[1], reach_of_noise(w, p["last_goal"])
+                # values that are positive by round-off after an event, or at the start, do not dip: near a
+                # triple zero, as after a lift-off, the cubic dips by its own error
+                level = [
+                    fresh & is_level(w, a, slope, b, h, noise)
+                    for a, slope, b in zip(*at_begin, at_end[0], strict=True)
+                ]
+
+                def with_rises(found: list[list[Number]]) -> list[list[Number]]:
+                    """Reverse the sign of values that have not left zero since their event. A value that
+                    rises and falls again within one step is then found as a new event.
+                    """
+                    return [
+                        [
+                            w.where(x > 0.0, -c, w.where(rests, kept, c_armed))
+                            for x, c, rests, c_armed in zip(
+                                p.every("disarmed"), values, level, now, strict=True
+                            )
+                        ]
+                        for values, now, kept in zip(found, armed(found), (1.0, 0.0), strict=True)
+                    ]
+
+                share = lowest(w, h, *map(with_rises, (at_begin, between(0.5), at_end)))
+                soon = between(2.0**-10)[1]
                 back = until_back(w, h, p["direction"], noise, at_begin, soon, at_end[0])
                 share = w.smaller(share, w.where(fresh, back, 1.0))
+            else:
+                share = lowest(w, h, at_begin, None, at_end)
             w.store(w.where(lasts, share, 1.0), dip)
 
         w.if_any(accept, seek_dips)
@@ -314,7 +315,6 @@ def monitored(
             at_once = follows & ~goes  # at the same time as a transition before it
             ends = at_once | (found & ~goes)
             p.put("search_slope", [w.where(at_once, math.inf, x) for x in p.every("search_slope")])
-            noise = reach_of_noise(w, p["last_goal"])
             left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
             p.put("disarmed", [w.where(gone, 0.0, x) for gone, x in zip(left, off, strict=True)])
             rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))

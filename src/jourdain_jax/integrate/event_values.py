@@ -166,9 +166,9 @@ def lowest(w, h, begin: list, middle: list | None, end: list):
 
 
 def until_back(w, h, direction, noise, begin: list, soon: Values, c_1: Values):
-    """Return half of the share of a step `h` after which a value that rises from zero is zero again if its
-    rate goes on to fall as it does at first; 1 if that is after the step. `begin`: values and rates; `soon`:
-    rates after 2^-10 of the step.
+    """Return half of the fraction of a step `h` after which a value that rises from zero would return to zero
+    if its rate kept falling as it does at the start; 1 if that lies beyond the step. `begin`: values and
+    rates; `soon`: rates after 2^-10 of the step.
     """
     found = w.number(1.0)
     for c, rate, later, end in zip(*begin, soon, c_1, strict=True):
