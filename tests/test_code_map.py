@@ -15,7 +15,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 475_656,
+    "code tokens of src": 475_655,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
     "caches": 50,
@@ -27,7 +27,7 @@ CEILINGS = {
     "ways: values and derivatives of constraints, for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
-    "code tokens of tests": 291_743,
+    "code tokens of tests": 292_254,
     "code tokens of bench": 98_611,
     "test files that reach private names": 32,
 }

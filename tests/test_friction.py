@@ -180,6 +180,56 @@ def test_bounces_by_lanes_end_at_the_limits_of_their_series():
     assert_allclose(balance, 0.17 * (G * 1.0285 + 0.1**2 / 2), rtol=1e-11)
 
 
+class TwoBlocks(Ball):
+    """Two blocks that do not meet."""
+
+    bounce: float = jj.parameter(0.5)
+    coordinates = jj.coordinates("x z other_x other_z")
+
+    def bodies(self, t, q):
+        here, there = [q.x, 0.0, q.z], [q.other_x, 1.0, q.other_z]
+        return {
+            name: jj.RigidBody(self.mass, jnp.eye(3), place, jnp.eye(3))
+            for name, place in {"one": here, "other": there}.items()
+        }
+
+    def contacts(self, pose):
+        law = {"height": "row", "friction": self.friction, "restitution": self.bounce}
+        return {name: jj.ball_contact(pose[name], self.radius, **law) for name in ("one", "other")}
+
+
+def test_bodies_that_do_not_meet_move_as_each_alone():
+    """A block slides and bounces: v_x falls by mu g dt on the ground and by mu (1 + e) v_z in each impact.
+    The other block, at rest or sliding on the ground at an impact, stays there.
+    """
+    heights, speeds = jax.random.uniform(jax.random.key(0), (2, 2, 60))
+    heights = jnp.where(heights < 0.4, 0.0, 0.3 * heights)
+    speeds = jnp.where(speeds < 0.3, 0.0, speeds)
+    scene = TwoBlocks()
+
+    def ends(height, speed):
+        """Return x and z at 1.5 s, when all rest."""
+        mu, e = scene.friction, scene.bounce
+        fall = jnp.sqrt(2 * height / G)
+        x, rise = speed * fall, G * fall
+        for _ in range(40):
+            speed = jnp.maximum(speed - mu * (1 + e) * rise, 0.0)
+            rise = e * rise
+            x += speed * 2 * rise / G
+        return jnp.stack([x + speed**2 / (2 * mu * G), scene.radius + 0 * x])
+
+    def found(heights, speeds):
+        (z, other_z), (x_rate, other_x_rate) = scene.radius + heights, speeds
+        start = {"z": z, "other_z": other_z, "x_rate": x_rate, "other_x_rate": other_x_rate}
+        motion = jj.simulate(scene, start, ts=[1.5], rtol=1e-9, atol=1e-9)
+        places = [[motion[f"{whose}{axis}"][0] for axis in "xz"] for whose in ("", "other_")]
+        return motion.result, jnp.array(places)
+
+    result, places = jax.vmap(found, in_axes=1)(heights, speeds)
+    assert_array_equal(result, SUCCESS)
+    assert_allclose(places, jnp.moveaxis(ends(heights, speeds), (0, 1, 2), (2, 1, 0)), atol=1e-10)
+
+
 class Tilted(Ball):
     """A ball on a slope, in coordinates along it."""
 

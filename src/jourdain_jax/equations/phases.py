@@ -148,7 +148,7 @@ STEADY = 1e-2  # numerics: greatest relative change of speed from a rebound to t
 
 def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tuple:
     """Return the impulses of an impact, by `impulse` at contact i or by Moreau's law at all contacts; which
-    contacts stay closed, and which stick; and whether the law has a solution, whether it is decided, and
+    contacts it closes, and which stick; and whether the law has a solution, whether it is decided, and
     whether there are several.
     """
     restitution = jnp.stack([jnp.asarray(row.restitution) for row in at.rows])
@@ -165,9 +165,7 @@ def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tup
     modes = found.modes._replace(rolls=found.modes.rolls.at[i].set(jnp.where(own.slips, 0.0, 1.0)))
     P = (borne[:, :3] @ own.P + borne[:, 3]).reshape(-1, 3).at[i].set(own.P)
     others = holds(law, P, modes).at[i].set(True)
-    by_itself = strikes[i] & ~jnp.any(strikes.at[i].set(False))
-    is_decided = by_itself & jnp.all(others) & jnp.all(jnp.isfinite(P))
-    stays = stays.at[i].set((w + at.found.G @ P.ravel())[3 * i] < LEAST_SLIP)
+    is_decided = strikes[i] & (jnp.sum(strikes) == 1) & jnp.all(others) & jnp.all(jnp.isfinite(P))
     return P, stays, modes.rolls, own.exists, is_decided, found.several
 
 
@@ -190,8 +188,8 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     """
     motion, rows = at.motion, at.found.rows
     hits, goes_on = jnp.any(strikes), jnp.any(begins)
-    closed = (at.number != FLIES) | (hits & at.settles)
-    P, stays, sticks, has_law, is_decided, several = _struck(at, closed | strikes, strikes, i)
+    closed = (at.number != FLIES) | strikes | (hits & at.settles)
+    P, stays, sticks, has_law, is_decided, several = _struck(at, closed, strikes, i)
     held = at.modes._replace(rolls=jnp.where(stops, 1.0, at.modes.rolls))
     stopping = responses(at.found.G, rows.w[:, None], held, at.friction)[:, 0]
     P = jnp.where(goes_on, 0.0, jnp.where(hits, P.ravel(), stopping))
@@ -200,7 +198,8 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     gained = 0.5 * P @ (rows.w + w.ravel())
     u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
 
-    touches = jnp.where(hits, stays, closed)
+    # a contact without an impulse, at rest up to round-off, counts as open in the law, but stays
+    touches = jnp.where(hits, stays | (closed & (w[:, 0] < LEAST_SLIP)), closed)
     slides = touches & jnp.where(goes_on, at.number == SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
     e = jnp.where((slides & ~goes_on)[:, None], unit(w[:, 1:]), at.modes.direction)
     numbers = jnp.where(touches, jnp.where(slides, SLIPS, ROLLS), FLIES)

@@ -262,7 +262,8 @@ def monitored(
             _, below = at_start(w, zero, at_begin[1], at_end[0], h, p["direction"], p["last_goal"])
             off = p.every("disarmed")
             returns = fresh & any_of((x > 0.0) & b for x, b in zip(off, below, strict=True))
-        sunk_now = fresh & any_of(sunk)  # the step began in a mode that had ended
+        # the step began in a mode that had ended; a failed step does not show whether a value is level
+        sunk_now = fresh & any_of(x & (accept | w.is_nan(0.0 * r)) for x, r in zip(sunk, rate_0, strict=True))
         sinks = [x & ~sunk_now for x in sinks]
         again = (any_of(sinks) | returns) & lasts
         dips = accept & ((share < 1.0) | again)
