@@ -23,9 +23,9 @@ from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled,
 from jourdain_jax.integrate.loop import native_motion
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Found, Start, flow
-from jourdain_jax.integrate.loop.native_motion import numbers_of, others_of
+from jourdain_jax.integrate.loop.native_motion import driven, numbers_of, others_of
 from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
-from jourdain_jax.integrate.loop.time_functions import driven, function_may_jump
+from jourdain_jax.integrate.loop.time_functions import function_may_jump
 from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved, Times
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.lowering.lowered_equations import Lowered

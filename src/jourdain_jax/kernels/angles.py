@@ -18,8 +18,7 @@ J. Dekker, Numerische Mathematik 18 (1971) 224; J.-M. Muller et al., Handbook of
 import math
 from collections.abc import Callable, Sequence
 
-from jourdain_jax.kernels.ir import Writer
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value, Writer
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
 DoubleDouble = tuple[Value, Value]  # head and low part

@@ -24,8 +24,7 @@ import numpy as np
 from jax.interpreters import mlir
 
 from jourdain_jax.kernels import host, nvidia
-from jourdain_jax.kernels.ir import Writer
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value, Writer
 
 HANDLER, KERNEL = "handler", "kernel"
 # tuning: words per array passed to a GPU kernel (`gpu.py`), and maximum number of arrays

@@ -23,8 +23,7 @@ import numpy as np
 from jax.interpreters import mlir
 
 from jourdain_jax.kernels import ffi, host, nvidia
-from jourdain_jax.kernels.ir import Writer
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value, Writer
 
 # words of the interface
 _CREATE_ERROR, _GET_STREAM, _ALLOCATE, _FREE = (6 + place for place in ffi.FUNCTIONS)

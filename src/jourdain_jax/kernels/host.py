@@ -107,9 +107,11 @@ def registers() -> int:
 
 def threads() -> int:
     """Return the number of threads that share a batch: one per usable core, or `JOURDAIN_JAX_THREADS`."""
+    variable = "JOURDAIN_JAX_THREADS"
+    if variable in os.environ:
+        return whole_number(os.environ[variable], f"the environment variable {variable}", MOST_THREADS)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    stated = os.environ.get("JOURDAIN_JAX_THREADS", str(min(cores, MOST_THREADS)))
-    return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", MOST_THREADS)
+    return min(cores, MOST_THREADS)
 
 
 def fuses() -> bool:

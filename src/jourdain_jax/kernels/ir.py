@@ -11,10 +11,46 @@ On a GPU (`device`) every thread runs the same code with its own lane; the threa
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
+from jourdain_jax.calculus.scalar_operations import COMPARISONS
 from jourdain_jax.kernels.inline_attributes import with_inlining
-from jourdain_jax.kernels.ir_value import COMPARED, Value
+
+
+def _operator(op: str, turned: bool = False) -> Callable[["Value", Any], "Value"]:
+    """Return the method that appends the operation or comparison `op`; `turned`: with swapped operands."""
+
+    def appended(self: "Value", other) -> "Value":
+        a, b = (self.writer.literal(other, self.type), self) if turned else (self, other)
+        return (self.writer.compared if op in COMPARISONS else self.writer.binary)(op, a, b)
+
+    return appended
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """Result of an instruction, an argument or a literal."""
+
+    writer: Any  # the `Writer` of the module
+    type: str
+    name: str
+    place: str = ""  # its memory location, if loaded or stored
+
+    __add__ = __radd__ = _operator("add")
+    __sub__, __rsub__ = _operator("sub"), _operator("sub", turned=True)
+    __mul__ = __rmul__ = _operator("mul")
+    __truediv__, __rtruediv__ = _operator("div"), _operator("div", turned=True)
+    __lt__, __le__ = _operator("lt"), _operator("le")
+    __gt__, __ge__ = _operator("gt"), _operator("ge")
+    equals, differs = _operator("eq"), _operator("ne")  # NaN is equal to nothing
+    __and__, __or__, __xor__ = _operator("and"), _operator("or"), _operator("xor")
+
+    def __neg__(self) -> "Value":
+        return self.writer.instruction(self.type, f"fneg {self.type} {self.name}")
+
+    def __invert__(self) -> "Value":
+        return self ^ -1
 
 
 class Writer:
@@ -172,12 +208,10 @@ class Writer:
 
     def compared(self, op: str, a: Value, b) -> Value:
         """Return a comparison; with NaN only `ne` holds."""
-        b, real = self.literal(b, a.type), "double" in a.type
-        found = self.truth if a.type.startswith("<") else "i1"
-        return self.instruction(
-            found,
-            f"{'fcmp' if real else 'icmp'} {COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}",
-        )
+        b, found = self.literal(b, a.type), self.truth if a.type.startswith("<") else "i1"
+        signed = "" if op in ("eq", "ne") else "s"
+        how = f"fcmp {'u' if op == 'ne' else 'o'}" if "double" in a.type else f"icmp {signed}"
+        return self.instruction(found, f"{how}{op} {a.type} {a.name}, {b.name}")
 
     def is_nan(self, a: Value) -> Value:
         """Return whether a number is NaN."""
@@ -290,14 +324,6 @@ class Writer:
         """
         everyone = self.literal(-1, "i32")
         return self.external("llvm.nvvm.vote.any.sync", "i1", everyone, a) if self.device else a
-
-    def thread(self) -> tuple[Value, Value]:
-        """Return the index of a GPU thread and the number of threads."""
-        block, size, own, blocks = (
-            self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64")
-            for name in ("ctaid", "ntid", "tid", "nctaid")
-        )
-        return block * size + own, blocks * size
 
     def any(self, a: Value) -> Value:
         """Return whether a boolean holds in any lane."""

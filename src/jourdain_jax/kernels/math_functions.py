@@ -21,8 +21,7 @@ from functools import partial
 from jourdain_jax.calculus.scalar_operations import COMPARISONS
 from jourdain_jax.kernels import angles
 from jourdain_jax.kernels.angles import WHOLE, polynomial, product_less, quotient, two_product, two_sum
-from jourdain_jax.kernels.ir import Writer
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value, Writer
 
 DoubleDouble = angles.DoubleDouble
 _LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # numerics: the first has 32 bits

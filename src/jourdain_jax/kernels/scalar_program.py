@@ -16,8 +16,7 @@ from typing import Any
 
 from jourdain_jax.kernels import host
 from jourdain_jax.kernels.angles import sine_and_cosine
-from jourdain_jax.kernels.ir import Writer
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value, Writer
 from jourdain_jax.kernels.math_functions import FUNCTIONS
 from jourdain_jax.program.graph import ARRAYS, Graph
 

@@ -275,7 +275,7 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
         right = right & (possible | setup.integrator.tried)
     fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
     code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
-    worst = jnp.min(at[-1][len(scene.inputs) - len(scene.switching.contacts) :], initial=0.0)
+    worst = jnp.min(at[-1][len(at[-1]) - len(scene.switching.contacts) :], initial=0.0)
     why = result_codes.IMPACT_GAINS_ENERGY - 1 - worst  # negative modes are codes
     code = jnp.where(worst < 0, why.astype(code.dtype), code)
     code = jnp.where(finite, code, result_codes.BAD_START)

@@ -45,7 +45,7 @@ from jourdain_jax.kernels.ffi import (
     taken_in,
     write_handler,
 )
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 
 # Words of a job, which all threads share: number of samples, number of times, index of the next sample; on a
 # GPU also the pointer to the record of steps, its number of slots per thread, the pointer to the shared rows,

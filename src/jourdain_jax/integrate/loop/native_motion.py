@@ -24,11 +24,12 @@ from jourdain_jax.integrate.loop.adjoint import flow_back, moved, rates_of_all
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.loop_function import Found, Start
 from jourdain_jax.integrate.loop.rate_functions import check_derivatives, event_program
-from jourdain_jax.integrate.loop.time_functions import driven
+from jourdain_jax.integrate.loop.time_functions import with_functions
 from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Passed, Setup, Solved
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.program.graph import Unsupported
 
 
@@ -65,6 +66,13 @@ def reason_against(
     if has_events and not field.lowers_events:
         return "a stop event is not part of the scalar program"
     return _reason_against_program(form_of(field, inputs, has_events, 1, True), order)
+
+
+def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
+    """Return the program with functions of time substituted for inputs, or why that is not possible."""
+    channels = inputs.channels
+    functions = tuple(x.program if isinstance(x, FunctionOfTime) else None for x in channels)
+    return with_functions(program, functions) if any(functions) else program
 
 
 @lru_cache(maxsize=64)

@@ -31,7 +31,7 @@ from jourdain_jax.calculus.roots import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.integrate.loop.lanes import MachineWriter
 from jourdain_jax.kernels.ffi import write_rows
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 from jourdain_jax.kernels.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.structure.row_program import RowProgram
 

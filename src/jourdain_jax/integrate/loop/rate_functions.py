@@ -20,7 +20,7 @@ from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, stated
 from jourdain_jax.integrate.loop.samples import looked_up
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 from jourdain_jax.kernels.scalar_program import as_real, unsupported, written, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList

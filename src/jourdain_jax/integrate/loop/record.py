@@ -18,7 +18,7 @@ from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, copied, each_row, room_of_lanes
 from jourdain_jax.integrate.loop.loop import COUNT, NEXT, RECORD, SLOTS, STARTS, TIMES, of_job
 from jourdain_jax.kernels.ffi import handed_out, lanes_taken, next_lane, taken_in
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 
@@ -161,7 +161,12 @@ def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
 
 def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
     """Return access to the slots of a thread. Numbers of neighbouring threads are interleaved in memory."""
-    here, (thread, threads) = w.room(slot.all), w.thread()
+    here = w.room(slot.all)
+    block, size, own, blocks = (
+        w.converted("zext", w.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64")
+        for name in ("ctaid", "ntid", "tid", "nctaid")
+    )
+    thread, threads = block * size + own, blocks * size
     record, slots = w.at(w.load(job, RECORD, "ptr"), thread), w.load(job, SLOTS, "i64")
 
     def place(number: Value, row: int | Value) -> Value:

@@ -14,7 +14,7 @@ uses table i T / N.
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter
 from jourdain_jax.kernels.ffi import Given, last_size, product
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 
 # words of a job: pointers to tables and knots, numbers of tables and rows of knots, samples per table, knots
 # per row

@@ -30,7 +30,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, stated
 from jourdain_jax.integrate.loop.rate_functions import known_values, outputs_of
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 from jourdain_jax.kernels.math_functions import exponential, logarithm
 from jourdain_jax.kernels.scalar_program import as_real, unsupported, written
 from jourdain_jax.program.derivative import on_its_own

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, TimeProgram
+from jourdain_jax.integrate.inputs import TimeProgram
 from jourdain_jax.lowering.lowered_equations import NODES, Lowered
 from jourdain_jax.lowering.relations import jumps, sided, switches
 from jourdain_jax.program.evaluate import Probes, depend_on
@@ -18,18 +18,6 @@ from jourdain_jax.structure.trace import Variables
 
 # limit for all functions of time; each number is a row of a lane, so long tables should use `jj.Sampled`
 MOST_NUMBERS = 200  # tuning
-
-
-def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
-    """Return the program with functions of time substituted for inputs, or why that is not possible."""
-    if not inputs.programs:
-        return program
-    return with_functions(
-        program,
-        tuple(
-            channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels
-        ),
-    )
 
 
 @lru_cache(maxsize=64)

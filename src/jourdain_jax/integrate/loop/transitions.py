@@ -26,7 +26,7 @@ from jourdain_jax.integrate.event_values import chosen
 from jourdain_jax.integrate.loop.form import Form
 from jourdain_jax.integrate.loop.lanes import Lanes, MachineWriter, Number, StepWriter, copied, each_row
 from jourdain_jax.integrate.loop.rate_functions import Outputs, given_values, known_values, tangents_of
-from jourdain_jax.kernels.ir_value import Value
+from jourdain_jax.kernels.ir import Value
 from jourdain_jax.kernels.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph, NodeList

@@ -38,8 +38,7 @@ from jourdain_jax.calculus.markers import entries_of, lanes_of, stopped
 from jourdain_jax.calculus.progress import all_objects_kept
 from jourdain_jax.calculus.reals import Indices, Scalar, Speeds, real_type
 from jourdain_jax.integrate.explicit_steps import off
-from jourdain_jax.integrate.loop.lanes import MachineWriter
-from jourdain_jax.integrate.loop.operands import Operands
+from jourdain_jax.integrate.loop.lanes import MachineWriter, Operands
 from jourdain_jax.kernels import ffi, gpu, host, nvidia
 from jourdain_jax.kernels.ffi import write_rows
 from jourdain_jax.kernels.scalar_program import as_real, unsupported, written_in_turn
