@@ -28,7 +28,7 @@ from .integrate.explicit_steps import Taylor
 from .integrate.implicit_steps import ImplicitMidpoint, RadauIIA
 from .integrate.inputs import Sampled
 from .integrate.result_codes import SimulationError
-from .integrate.state_projection import State
+from .integrate.state import State
 from .integrate.vector_fields.field import Formulation
 from .lowering.lower import lower
 from .lowering.lowered_equations import Lowered, NotLowered

@@ -28,7 +28,7 @@ from jourdain_jax.calculus.reals import (
 from jourdain_jax.equations.reductions import scaled
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.scene.coordinates import Coordinates, Labels, check_names
 from jourdain_jax.scene.scene import Scene

@@ -37,7 +37,7 @@ from jourdain_jax.calculus.reals import Count, Indices, Scalar, all_finite, hold
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import result_codes
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state import State, state_of
 from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state

@@ -17,7 +17,7 @@ from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.integrate.inputs import as_inputs
 from jourdain_jax.integrate.loop import native_motion
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.kernels import ffi
 from jourdain_jax.motion.model import Model, build, modelled
 from jourdain_jax.motion.simulate import as_state

@@ -35,7 +35,7 @@ from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.contact_laws import SLOW, moves
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.phases import At, contacts_at_start
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state import State, state_of
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.program.eager import eval_numpy

@@ -57,7 +57,7 @@ from jourdain_jax.equations.virtual_power import (
     on_speeds,
     unconstrained_equations,
 )
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.motion.check import check as look_for_mistakes
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.start import consistent

@@ -45,7 +45,7 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, violations
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import Flag, Number, Scalar, real_type
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state import State, state_of
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
 _SPEED = 4.0  # physics, m/s: of the second linearisation

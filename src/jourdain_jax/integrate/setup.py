@@ -20,7 +20,7 @@ from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.input_knots import knots_between
 from jourdain_jax.integrate.inputs import samples_in
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.structure.structure import Reference

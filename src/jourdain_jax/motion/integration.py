@@ -7,12 +7,14 @@ returned as a `Trajectory`. Drift of energy or constraints sets further result c
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.compilation import RUN_SELDOM
 from jourdain_jax.calculus.derivatives import with_derivatives_of
@@ -20,14 +22,15 @@ from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
-from jourdain_jax.integrate.constraint_projection import validity
+from jourdain_jax.integrate.constraint_projection import coordinates_elsewhere, projected
 from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, for_programs, in_phases
-from jourdain_jax.integrate.loop import value_kernels
+from jourdain_jax.integrate.loop.value_kernels import beside, entries, nodes_called
 from jourdain_jax.integrate.own_steps import reason_against_watching
 from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
-from jourdain_jax.integrate.state_projection import State, coordinates_elsewhere, projected
+from jourdain_jax.integrate.state import State
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant
+from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.motion.drift import (
     MOST_STEP_ERRORS,
     conserves,
@@ -41,7 +44,7 @@ from jourdain_jax.motion.trajectories.values_in_time import Phases
 from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.modes import Modes
 from jourdain_jax.structure.plausibility import faults_at
-from jourdain_jax.structure.row_program import row_program
+from jourdain_jax.structure.row_program import RowProgram, row_program
 
 
 def integrate(setup: Setup) -> Trajectory:
@@ -60,7 +63,7 @@ def _started(setup: Setup) -> tuple[Setup, Setup, Scalar, Begun]:
     # derivatives keep the original types
     given = setup._replace(**in_default_precision(numbers))
     if isinstance(given.field, ByProgram) and not given.reason_against_machine_code:
-        given = given._replace(field=replace(given.field, native=value_kernels.beside(given.field.program)))
+        given = given._replace(field=replace(given.field, native=beside(given.field.program)))
     given = _in_contact(given)
     timely, (setup, asked) = given.timely, _entered(given)
     if setup.reason_against_machine_code:
@@ -262,7 +265,7 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
     """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
-    valid = None if program is None else validity(program)
+    valid = None if program is None else _validity(program)
     unneeded = setup.judged or (valid is not None and not valid.others)
     others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, valid is not None)
     if valid is None:
@@ -282,6 +285,26 @@ def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count
     if timely is not np.True_:
         code = jnp.where(timely, code, result_codes.BAD_TIMES)
     return jnp.where(right, code, result_codes.BAD_PARAMETER)
+
+
+class _Validity(NamedTuple):
+    """The truth values `RowProgram.right`, by machine code."""
+
+    others: int  # number of coordinates of other states
+    at: Callable[..., Bool[Array, "3"]]  # function of the scene, t, q, u, inputs and these coordinates
+
+
+@lru_cache(maxsize=64)
+def _validity(program: RowProgram) -> _Validity | None:
+    """Return the validity of a start; None if machine code cannot evaluate it."""
+    if unsupported(program.graph, program.right):
+        return None
+    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    values = nodes_called(program.graph, program.right, given)
+    return _Validity(
+        len(program.others),
+        lambda scene, *state: values(*stopped((*entries(scene, program.parameters), *state))) > 0,
+    )
 
 
 def _result(setup: Setup, sound: Flag, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:

@@ -31,7 +31,7 @@ from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.explicit_steps import Taylor
 from jourdain_jax.integrate.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.integrate.setup import MEMORY
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.integrate.vector_fields.field import VectorField
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.model import modelled

@@ -34,7 +34,7 @@ from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMetho
 from jourdain_jax.integrate.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.integrate.own_steps import own_steps
 from jourdain_jax.integrate.setup import LONGEST, MEMORY, Setup, ends_fit
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options

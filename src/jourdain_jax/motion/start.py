@@ -3,7 +3,7 @@
 g(t, q) = 0,  phi(t, q, u) = 0
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from jourdain_jax.calculus.compilation import compiled_quickly
 from jourdain_jax.calculus.reals import (
@@ -28,17 +29,15 @@ from jourdain_jax.calculus.reals import (
 )
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
-from jourdain_jax.integrate.inputs import inputs_at
-from jourdain_jax.integrate.state_projection import (
+from jourdain_jax.integrate.constraint_projection import (
     OFF,
     Guess,
-    State,
     contradiction,
-    free_entries,
     left_of,
-    may_contradict,
     put_onto_constraints,
 )
+from jourdain_jax.integrate.inputs import inputs_at
+from jourdain_jax.integrate.state import State
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.program.eager import eval_numpy
 from jourdain_jax.program.evaluate import depend_on
@@ -55,7 +54,7 @@ from jourdain_jax.scene.arguments import (
 from jourdain_jax.scene.coordinates import Labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.structure.sampling import guesses_of
-from jourdain_jax.structure.structure import structure_of
+from jourdain_jax.structure.structure import Structure, structure_of
 
 _NOTHING: Mapping = MappingProxyType({})
 
@@ -267,3 +266,35 @@ def _refuse(scene: Scene, start: Guess, state: State, inputs, given: Labels) -> 
         f"{np.concatenate([g, phi])[worst]:.3g} remains with the given values held ({held}). Give fewer "
         f"values{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )
+
+
+def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
+    """Return a mask of the names that are not held."""
+    return np.array([name not in held for name in names], bool)
+
+
+def may_contradict(
+    scene: Scene,
+    known: Structure,
+    free_q: Bool[np.ndarray, "coordinates"],
+    free_u: Bool[np.ndarray, "speeds"],
+) -> bool:
+    """Return whether held values (entries that are not free) may contradict each other. `known`: structure of
+    the scene. If
+
+        rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: columns of the free variables
+
+    values can contradict each other only at isolated configurations.
+    """
+    # if all dependent speeds are free, the constraints determine them
+    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))
+    of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+    if of_speeds and not known.affine:
+        return True
+    return (of_coordinates and _loses_rank(known.closure_slopes, free_q)) or (
+        of_speeds and _loses_rank(known.row_slopes, free_u)
+    )
+
+
+def _loses_rank(matrices, free) -> bool:
+    return any(np.linalg.matrix_rank(one * free) < np.linalg.matrix_rank(one) for one in matrices)

@@ -13,7 +13,7 @@ import numpy as np
 
 from jourdain_jax.calculus.rotations import onto_axis
 from jourdain_jax.equations.kinematics import motion_at, pose_at
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import map_over_times
 from jourdain_jax.program.eager import eager_if_concrete

@@ -14,7 +14,7 @@ from jourdain_jax.analysis.families.critical import FOUND, MEANINGS, SINGULAR, p
 from jourdain_jax.analysis.families.equations import Look, SteadyEquations, null_space, numbered
 from jourdain_jax.analysis.families.special_points import SURE
 from jourdain_jax.calculus.reals import largest, static
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.coordinates import Labels, as_names, parameters_of
 from jourdain_jax.scene.printing import Printed, complex_numbers, table

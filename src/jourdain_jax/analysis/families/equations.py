@@ -23,7 +23,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from jourdain_jax.analysis.motion_derivatives import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.calculus.lazy_imports import module_on_first_use
 from jourdain_jax.calculus.reals import Scalar, largest
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state import State, state_of
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.coordinates import Labels, check_name
 from jourdain_jax.scene.scene import Scene, state_names

@@ -15,7 +15,7 @@ from jourdain_jax.analysis.families.special_points import SURE, across, first_po
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.calculus.lazy_imports import needed
 from jourdain_jax.calculus.reals import Indices, Numbers, checked_known, largest
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.scene.arguments import (
     BuiltFor,
     as_input_vector,

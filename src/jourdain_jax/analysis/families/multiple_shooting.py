@@ -12,7 +12,7 @@ from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Indices, PerRow, PerTime, Scalar, static
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.integrate.inputs import Inputs, inputs_at
-from jourdain_jax.integrate.state_projection import state_of
+from jourdain_jax.integrate.state import state_of
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.coordinates import Labels

@@ -45,7 +45,7 @@ from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.rows import names_of_events
 from jourdain_jax.integrate.explicit_steps import diffrax
 from jourdain_jax.integrate.inputs import as_inputs, inputs_at
-from jourdain_jax.integrate.state_projection import State, state_of
+from jourdain_jax.integrate.state import State, state_of
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import as_state

@@ -57,7 +57,7 @@ from jourdain_jax.identification.inference.correlated_noise import log_densities
 from jourdain_jax.identification.solve.run_groups import equal_runs
 from jourdain_jax.identification.solve.shooting import Run
 from jourdain_jax.integrate.inputs import Inputs, as_inputs, inputs_at
-from jourdain_jax.integrate.state_projection import State
+from jourdain_jax.integrate.state import State
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import consistent

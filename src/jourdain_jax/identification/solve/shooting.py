@@ -45,7 +45,7 @@ from jourdain_jax.identification.data.experiment import (
 )
 from jourdain_jax.identification.solve.layout import Layout
 from jourdain_jax.integrate.inputs import Inputs, Sampled
-from jourdain_jax.integrate.state_projection import state_of
+from jourdain_jax.integrate.state import state_of
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene, state_names

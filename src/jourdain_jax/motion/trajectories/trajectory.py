@@ -19,8 +19,9 @@ from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.rows import names_of_bodies
 from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.constraint_projection import known_faults_at
 from jourdain_jax.integrate.inputs import inputs_at
-from jourdain_jax.integrate.state_projection import State, known_faults_at
+from jourdain_jax.integrate.state import State
 from jourdain_jax.lowering.sides import bent_load
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labels, values_in_time
