@@ -29,12 +29,7 @@ from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Flag, PerCoordinate, PerRow, Speeds
 from jourdain_jax.calculus.roots import fixed_point
 from jourdain_jax.equations.reductions import cholesky, row_scale, speed_scale
-from jourdain_jax.equations.rows import (
-    names_of_position_rows,
-    names_of_rows,
-    position_residual,
-    velocity_residual,
-)
+from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
 
@@ -236,8 +231,6 @@ def project_speeds(
     - `by`: the evaluation of constraints and mass matrix.
     - `plain`: if samples may share the numbers of the scene, the same scene without derivatives.
     """
-    if not names_of_rows(scene):
-        return u
     free = jnp.ones(u.shape, bool) if free is None else jnp.asarray(free)
     parameters = by.given(scene, *plain)
     M = None if determined else by.masses(parameters, t, q)

@@ -106,7 +106,7 @@ def put_positions(
     """Return the coordinates nearest to q that satisfy the geometric constraints, and the residual. `known`:
     both results if already computed; then only derivatives are added.
     """
-    if usual.program is not None and not usual.program.g:
+    if not len(usual.closures):
         return q, jnp.zeros(0, q.dtype)
 
     def by_xla(by: RowFunctions, scenes, t, q, free, lengths):
@@ -123,7 +123,7 @@ def put_positions(
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Speeds, PerRow]:
     """Return the speeds nearest to u that satisfy the velocity constraints, and the residual."""
     affine, determined = usual.affine, usual.determined
-    if usual.program is not None and not usual.program.phi:
+    if not len(usual.rows):
         return u, jnp.zeros(0, u.dtype)
 
     def by_xla(by: RowFunctions, scenes, t, q, u, inputs, free, lengths):
