@@ -1,4 +1,4 @@
-"""Setup of a motion for an integrator, and the results of an integrator.
+"""Setup of a motion for an integrator, the check of its start, and the results of an integrator.
 
 Integrators use the time since the start, tau = t - t0, because a time far from zero has few digits after the
 point. Scenes that do not depend on time are therefore equally accurate at any t0. Rates, projection and
@@ -6,6 +6,8 @@ events receive tau; the scene and its inputs receive t0 + tau.
 """
 
 import abc
+from collections.abc import Callable
+from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -14,15 +16,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jourdain_jax.calculus.markers import stopped
 from jourdain_jax.calculus.reals import Count, Entries, Flag, PerLane, PerTime, Scalar, eps_of
-from jourdain_jax.integrate.constraint_projection import Usual
+from jourdain_jax.integrate import result_codes
+from jourdain_jax.integrate.constraint_projection import Usual, coordinates_elsewhere
+from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import Method, diffrax
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.input_knots import knots_between
 from jourdain_jax.integrate.inputs import samples_in
+from jourdain_jax.integrate.loop.value_kernels import entries, nodes_called
 from jourdain_jax.integrate.state import State
-from jourdain_jax.integrate.vector_fields.field import Integrated, VectorField
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
+from jourdain_jax.kernels.scalar_program import unsupported
+from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.structure.plausibility import faults_at
+from jourdain_jax.structure.row_program import RowProgram, row_program
 from jourdain_jax.structure.structure import Reference
 
 MEMORY = 2**32  # tuning: bytes, unless a model sets a limit
@@ -214,3 +224,51 @@ def ends_fit(first, last, t0, t1, eps: float) -> "Flag | bool":
     for inside in ((first - t0) * direction, (t1 - last) * direction):
         fits = fits & ((inside >= -4 * eps * abs(t0)) | (inside >= -4 * eps * abs(t1)))
     return fits
+
+
+def code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count:
+    """Check parameters, bodies, contacts, times and the start. Return RUNNING, or the code of the first
+    fault.
+    """
+    scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
+    program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
+    valid = None if program is None else _validity(program)
+    unneeded = setup.judged or (valid is not None and not valid.others)
+    others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, valid is not None)
+    if valid is None:
+        faults = faults_at(scene, *at, others, not setup.integrator.tried)
+        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
+    else:
+        nowhere = np.full(valid.others, jnp.nan)
+        right, possible, finite = valid.at(scene, *at, nowhere if unneeded else others.ravel())
+        right = right & (possible | setup.integrator.tried)
+    fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
+    code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
+    worst = jnp.min(at[-1][len(at[-1]) - len(scene.switching.contacts) :], initial=0.0)
+    why = result_codes.IMPACT_GAINS_ENERGY - 1 - worst  # negative modes are codes
+    code = jnp.where(worst < 0, why.astype(code.dtype), code)
+    code = jnp.where(finite, code, result_codes.BAD_START)
+    if timely is not np.True_:
+        code = jnp.where(timely, code, result_codes.BAD_TIMES)
+    return jnp.where(right, code, result_codes.BAD_PARAMETER)
+
+
+class _Validity(NamedTuple):
+    """The truth values `RowProgram.right`, by machine code."""
+
+    others: int  # number of coordinates of other states
+    at: Callable[..., Bool[Array, "3"]]  # function of the scene, t, q, u, inputs and these coordinates
+
+
+@lru_cache(maxsize=64)
+def _validity(program: RowProgram) -> _Validity | None:
+    """Return the validity of a start; None if machine code cannot evaluate it."""
+    if unsupported(program.graph, program.right):
+        return None
+    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
+    values = nodes_called(program.graph, program.right, given)
+    return _Validity(
+        len(program.others),
+        lambda scene, *state: values(*stopped((*entries(scene, program.parameters), *state))) > 0,
+    )

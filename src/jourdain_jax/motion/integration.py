@@ -2,49 +2,55 @@
 
 The integrator, this package's loop over steps or diffrax, returns the states at the saved times, which times
 were reached, and where and why the motion ended. Dependent speeds are then computed, and all results are
-returned as a `Trajectory`. Drift of energy or constraints sets further result codes (`drift.py`).
+returned as a `Trajectory`. Drift of energy or constraints sets further result codes, even inside `jit` and
+for each sample of a batch.
+
+*Energy.* If all work comes from a potential, T + V is constant. Step-size control leaves an error of about
+`atol + rtol |y|` per step in each entry y of the state. If errors of this size in all entries change the
+energy by dE, then N steps change it by about N dE, and round-off changes it by about N eps of its value. Over
+all models, at tolerances from 1e-4 to 1e-11, no drift exceeded half of N dE. A drift of more than ten times
+N dE and more than 1 % of the varying energy therefore indicates an error, such as an undetected singular
+position.
+
+*Constraints.* Redundant constraints that the start satisfies may contradict each other later, unless
+phi_0 = 0:
+
+    A u + phi_0 = 0,   rank A < number of rows
+
+An omitted constraint then holds only if phi_0 is in the range of A.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.compilation import RUN_SELDOM
 from jourdain_jax.calculus.derivatives import with_derivatives_of
 from jourdain_jax.calculus.markers import entered, lanes_first, left, stopped
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, eps_of, in_default_precision
+from jourdain_jax.calculus.reals import Count, Flag, PerTime, Scalar, eps_of, in_default_precision
+from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.integrate import integrands, result_codes
-from jourdain_jax.integrate.constraint_projection import coordinates_elsewhere, projected
+from jourdain_jax.integrate.constraint_projection import projected
 from jourdain_jax.integrate.event_search import RUNNING
+from jourdain_jax.integrate.explicit_steps import off
+from jourdain_jax.integrate.implicit_steps import FixedStepMethod
 from jourdain_jax.integrate.inputs import Constant, Inputs, Mode, for_programs, in_phases
-from jourdain_jax.integrate.loop.value_kernels import beside, entries, nodes_called
+from jourdain_jax.integrate.loop.value_kernels import beside
 from jourdain_jax.integrate.own_steps import reason_against_watching
-from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved
-from jourdain_jax.integrate.state import State
-from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant
-from jourdain_jax.kernels.scalar_program import unsupported
-from jourdain_jax.motion.drift import (
-    MOST_STEP_ERRORS,
-    conserves,
-    energies_near,
-    energy_lost,
-    rows_violated,
-    step_errors,
-)
+from jourdain_jax.integrate.setup import Begun, Passed, Plain, Setup, Solved, code_at_start
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Instant, Integrated
+from jourdain_jax.motion.trajectories import diagnostics
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.values_in_time import Phases
-from jourdain_jax.scene.coordinates import parameter_faults
 from jourdain_jax.scene.modes import Modes
-from jourdain_jax.structure.plausibility import faults_at
-from jourdain_jax.structure.row_program import RowProgram, row_program
+
+MOST_STEP_ERRORS = 10  # numerics: largest drift, as a multiple of the errors of N steps at the tolerance
 
 
 def integrate(setup: Setup) -> Trajectory:
@@ -148,7 +154,7 @@ def _begin(
         usual = replace(setup.usual, plain=plain.args[1:2] if plain else ())
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), usual)
     args = field, scene, setup.inputs, field.fixed(scene) if fixed is None else fixed, setup.t0
-    code = _code_at_start(setup._replace(scene=plain.args[1] if plain else scene), start, timely)
+    code = code_at_start(setup._replace(scene=plain.args[1] if plain else scene), start, timely)
     return Begun(code, start, args, field.pack(start.q, start.u), plain)
 
 
@@ -179,7 +185,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         if stored_first is not None:
             work = work + field.stored(scene, at.t, y.q, at.inputs) - stored_first
         state = at.t, y.rows if puts_back else rows, at.inputs
-        return (y.q, u, work), pivot, state, step_errors(setup, free, y) if puts_back else None
+        return (y.q, u, work), pivot, state, _step_errors(setup, free, y) if puts_back else None
 
     found, pivots, states, moved_by = jax.vmap(at_state)(ts, rows)
     # negative if A_z was singular along the motion; NaN marks an unknown end state and is ignored
@@ -191,11 +197,11 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     if puts_back:
         drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted)
         causes.append((drifted, result_codes.OFF_CONSTRAINTS))
-    if conserves(setup):
-        near = energies_near(setup, plain, states, begun.y0.with_rows)
-        causes.append((energy_lost(*near, solved.accepted), result_codes.ENERGY_LOST))
+    if _conserves(setup):
+        near = _energies_near(setup, plain, states, begun.y0.with_rows)
+        causes.append((_energy_lost(*near, solved.accepted), result_codes.ENERGY_LOST))
     if field.rows_may_contradict:
-        violated = rows_violated(setup, states[0], *found[:2])
+        violated = _rows_violated(setup, states[0], *found[:2])
         causes.append((violated, result_codes.CONTRADICTORY_ROWS))
     unwatched = reason_against_watching(setup)
     result = _result(setup, sound, solved, pivot, causes)
@@ -259,54 +265,6 @@ def _phases(
     return Phases(jnp.where(there, ts, jnp.nan), events, modes, lost, names, named)
 
 
-def _code_at_start(setup: Setup, start: State, timely: Flag | np.bool_) -> Count:
-    """Check parameters, bodies, contacts, times and the start. Return RUNNING, or the code of the first
-    fault.
-    """
-    scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
-    program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
-    valid = None if program is None else _validity(program)
-    unneeded = setup.judged or (valid is not None and not valid.others)
-    others = np.zeros((0, len(start.q))) if unneeded else coordinates_elsewhere(scene, valid is not None)
-    if valid is None:
-        faults = faults_at(scene, *at, others, not setup.integrator.tried)
-        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults.values()]))
-        finite = jnp.all(jnp.isfinite(jnp.concatenate([start.q, start.u])))
-    else:
-        nowhere = np.full(valid.others, jnp.nan)
-        right, possible, finite = valid.at(scene, *at, nowhere if unneeded else others.ravel())
-        right = right & (possible | setup.integrator.tried)
-    fits = start.residual <= 1e3 * np.sqrt(eps_of(start.q))
-    code = jnp.where(fits, RUNNING, result_codes.INCONSISTENT_START)
-    worst = jnp.min(at[-1][len(at[-1]) - len(scene.switching.contacts) :], initial=0.0)
-    why = result_codes.IMPACT_GAINS_ENERGY - 1 - worst  # negative modes are codes
-    code = jnp.where(worst < 0, why.astype(code.dtype), code)
-    code = jnp.where(finite, code, result_codes.BAD_START)
-    if timely is not np.True_:
-        code = jnp.where(timely, code, result_codes.BAD_TIMES)
-    return jnp.where(right, code, result_codes.BAD_PARAMETER)
-
-
-class _Validity(NamedTuple):
-    """The truth values `RowProgram.right`, by machine code."""
-
-    others: int  # number of coordinates of other states
-    at: Callable[..., Bool[Array, "3"]]  # function of the scene, t, q, u, inputs and these coordinates
-
-
-@lru_cache(maxsize=64)
-def _validity(program: RowProgram) -> _Validity | None:
-    """Return the validity of a start; None if machine code cannot evaluate it."""
-    if unsupported(program.graph, program.right):
-        return None
-    given = [*program.entries, program.t, *program.q, *program.u, *program.inputs, *program.others]
-    values = nodes_called(program.graph, program.right, given)
-    return _Validity(
-        len(program.others),
-        lambda scene, *state: values(*stopped((*entries(scene, program.parameters), *state))) > 0,
-    )
-
-
 def _result(setup: Setup, sound: Flag, solved: Solved, pivot, of_drift: list[tuple[Flag, int]]) -> Count:
     """Return the result code: the integrator's, or that of a condition found after it. `sound`: whether the
     start is valid; `of_drift`: conditions for motions that reached their end, with their codes.
@@ -322,3 +280,82 @@ def _result(setup: Setup, sound: Flag, solved: Solved, pivot, of_drift: list[tup
     if setup.field.needs_pivot:
         code = jnp.where(sound & (pivot < SMALLEST_PIVOT), result_codes.SINGULAR_PARTITION, code)
     return code
+
+
+def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
+    """Return how far a projection moved a state from `free` to `y`, in units of the step tolerance."""
+    rtol, atol = setup.tolerances
+    parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
+    return jnp.max(
+        jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts])
+    )
+
+
+def _conserves(setup: Setup) -> bool:
+    """Return whether T + V is constant along a motion with step-size control.
+
+    False if work is integrated: work may be a small difference of large powers, so that step-size control
+    does not bound its error.
+    """
+    return (
+        setup.field.conserves
+        and all(setup.field.stops)
+        and not isinstance(setup.integrator.solver, FixedStepMethod)
+    )
+
+
+def _energies_near(
+    setup: Setup,
+    args,
+    states: tuple[PerTime, Float[Array, "times rows"], Float[Array, "times inputs"]],
+    of_rows: Callable[[Array], Integrated],
+) -> tuple[Float[Array, "times 2"], Float[Array, "times 2"]]:
+    """Return T and V (J) at the states, and again with each coordinate and speed increased by its tolerance.
+
+    `states`: times, state vectors, inputs; `of_rows` unpacks a state vector.
+    """
+    field, fixed = setup.field, args[3]
+
+    def at(state):
+        t, rows, inputs = state
+        here = Instant(setup.scene, fixed, t, of_rows(rows), inputs)
+        if isinstance(field, ByProgram) and field.native:
+            return field.native.energies(*here.of_program, *setup.tolerances).reshape(2, 2)
+        both = jnp.stack([rows, off(jnp.where, jnp.abs, rows, *setup.tolerances)])
+        return jax.lax.map(lambda rows: field.energies(here._replace(y=of_rows(rows))), both)
+
+    # loads in dense matrices may be callbacks that cannot be batched
+    states = stopped(states)
+    found = jax.lax.map(at, states) if field.lowered is None else jax.vmap(at)(states)
+    return found[:, 0], found[:, 1]
+
+
+def _energy_lost(at: Float[Array, "times 2"], near: Float[Array, "times 2"], steps) -> Flag:
+    """Return whether T + V changed by more than the errors of `steps` steps can explain. `at`, `near`: the
+    two results of `_energies_near`.
+    """
+    errors = jnp.abs(near - at) + eps_of(at) * jnp.abs(at)
+    energy, error = at[:, :1] + at[:, 1:], errors[:, :1] + errors[:, 1:]
+    every = jnp.concatenate([at, -at, energy, -energy, error], axis=1)
+    most = jnp.max(jnp.where(jnp.isnan(every), -jnp.inf, every), axis=0)
+    of_potential, of_energy = most[1] + most[3], most[4] + most[5]  # ranges
+    allowed = diagnostics.DRIFTED * (most[0] + of_potential), MOST_STEP_ERRORS * steps * most[6]
+    return of_energy > jnp.maximum(*allowed)
+
+
+def _rows_violated(
+    setup: Setup, t: PerTime, q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]
+) -> Flag:
+    """Return whether any constraint is violated at any of these states. Unreached states (NaN) are ignored.
+
+    violated: |phi| > 1 % of the maximum over time of (|phi - A u| + |A| |u|)
+    """
+    scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
+
+    def left_and_size(state):
+        phi, A = linearised_rows(scene, *state, inputs(state[0]))
+        return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
+
+    left, size = jax.lax.map(left_and_size, states)  # constraints may be callbacks that cannot be batched
+    # 1 % is far above the residual that steps at loose tolerances leave
+    return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

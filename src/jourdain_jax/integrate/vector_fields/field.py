@@ -171,7 +171,7 @@ class VectorField(eqx.Module):
     conserves: bool = static()  # T + V is constant along every motion
     projects_positions: bool = static()
     projects_speeds: bool = static()
-    # whether constraints that the start satisfies may contradict each other later (`motion/drift.py`)
+    # whether constraints that the start satisfies may contradict each other later (`motion/integration.py`)
     rows_may_contradict: bool = static()
     of_inputs: Indices = static()  # indices of loads whose potential depends on inputs
     event_names: Labels = static()  # sorted
