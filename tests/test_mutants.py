@@ -34,8 +34,8 @@ from jourdain_jax.integrate.arrays import array_motion as motions
 from jourdain_jax.integrate.arrays.array_loop import Loop
 from jourdain_jax.integrate.arrays.array_writer import ArrayWriter
 from jourdain_jax.integrate.explicit_steps import method_of
-from jourdain_jax.integrate.loop import native_motion, step
-from jourdain_jax.integrate.loop.loop_function import Start
+from jourdain_jax.integrate.loop import step
+from jourdain_jax.integrate.loop.loop_function import Start, solved
 from jourdain_jax.integrate.vector_fields.field import Integrated
 from jourdain_jax.lowering import appell, lower, multipliers, partial_velocities
 from jourdain_jax.models import MODELS
@@ -178,7 +178,7 @@ def motion(run):
     @jax.jit
     def found(*arguments):
         of, start = run(*arguments)
-        return native_motion.solved(of.form, start.goals, motions.flow(of, 0)(start))
+        return solved(of.form, start.goals, motions.flow(of, 0)(start))
 
     return found
 
@@ -278,7 +278,7 @@ def weighed(end):
 def backwards_through(of, start):
     """Its derivatives by the start and by k, in reverse mode."""
     found = jax.jit(motions.flow(of, 0))(start)
-    g = jax.grad(lambda found: weighed(native_motion.solved(of.form, start.goals, found)))(found)
+    g = jax.grad(lambda found: weighed(solved(of.form, start.goals, found)))(found)
     by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(start, g)
     return by_y0, by_k
 

@@ -16,7 +16,7 @@ from jourdain_jax.analysis.integrability import (
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.integrate.inputs import as_inputs
-from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.own_steps import reason_against
 from jourdain_jax.integrate.state import State
 from jourdain_jax.kernels import ffi
 from jourdain_jax.motion.model import Model, build, modelled
@@ -253,7 +253,7 @@ def _lowering(built: Model) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
-    reason = native_motion.reason_against(
+    reason = reason_against(
         modelled(built.scene).field(), built.scene, as_inputs(built.scene, None), bool(built.events)
     )
     where = f"not to machine code: {reason}" if reason else f"to machine code{ffi.devices()}"

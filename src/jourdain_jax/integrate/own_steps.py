@@ -5,12 +5,13 @@ otherwise in JAX, where batches of a scalar program run in blocks of `width` sam
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from jourdain_jax.calculus.derivative_errors import SECOND_ORDER_MESSAGE, DifferentiationModeError
 from jourdain_jax.calculus.derivatives import Rules, pushed_by_jax, with_derivatives_of, with_rules
@@ -19,20 +20,46 @@ from jourdain_jax.integrate import result_codes
 from jourdain_jax.integrate.arrays import array_motion as on_arrays
 from jourdain_jax.integrate.explicit_steps import Method, method_of
 from jourdain_jax.integrate.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.integrate.inputs import FunctionOfTime, Inputs, Mode, Sampled, in_phases
-from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.inputs import (
+    Constant,
+    FunctionOfTime,
+    Inputs,
+    Mode,
+    Sampled,
+    in_phases,
+    samples_in,
+)
+from jourdain_jax.integrate.loop import native_motion, taylor
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.loop_function import OF_SAMPLES, Found, Start, flow
-from jourdain_jax.integrate.loop.native_motion import driven, numbers_of, others_of
-from jourdain_jax.integrate.loop.rate_functions import reason_against_derivatives
+from jourdain_jax.integrate.loop.loop_function import (
+    OF_SAMPLES,
+    Found,
+    Start,
+    driven,
+    flow,
+    form_of,
+    modes_among,
+    numbers_of,
+    others_of,
+    solved,
+    start_of,
+)
+from jourdain_jax.integrate.loop.rate_functions import event_program, reason_against_derivatives
 from jourdain_jax.integrate.loop.time_functions import function_may_jump
 from jourdain_jax.integrate.setup import Begun, Integrator, Setup, Solved, Times
 from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
+from jourdain_jax.kernels import ffi
+from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.lowering.lowered_equations import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.lowering.sides import loads_have_relations, may_jump, with_sides
-from jourdain_jax.program.graph import ARRAYS
+from jourdain_jax.program.graph import ARRAYS, Unsupported
 from jourdain_jax.scene.scene import Scene
+
+# Limit on the number of operations. Measured compile times: 15,000 operations of a chain of 128 trailers take
+# 2.8 s (XLA: 40 s), 18,000 operations of a chain of 23 joint angles take 1.2 s.
+LARGEST_PROGRAM = 60_000  # tuning
+MOST_PRODUCTS = 12_000  # tuning: limit on products of coefficients in a Taylor step, whose code has no loops
 
 
 @jax.tree_util.register_static
@@ -60,9 +87,7 @@ class OwnSteps(Integrator):
             return "another backend was requested"
         if not isinstance(self.solver, Method):
             return "the solver is implicit"
-        return native_motion.reason_against(
-            setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order
-        )
+        return reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         native = not setup.reason_against_machine_code
@@ -73,7 +98,7 @@ class OwnSteps(Integrator):
             form, start, flow, back, reason = way(*in_sides(setup, begun))
             rules = Rules(pushed_by_jax(flow), partial(_pulled, back), lambda *_: reason())
             found = (flow if self.tried else with_rules(flow, rules))(start)
-            return native_motion.solved(form, start.goals, found)
+            return solved(form, start.goals, found)
 
         return _on_times(run, mover, setup, begun)
 
@@ -88,14 +113,14 @@ class OwnSteps(Integrator):
         return _Way(of.form, start, on_arrays.flow(of, at_once), back, lambda: SECOND_ORDER_MESSAGE)
 
     def _form(self, setup: Setup) -> Form:
-        return native_motion.form_of(setup.field, setup.inputs, **self._events(setup))
+        return form_of(setup.field, setup.inputs, **self._events(setup))
 
     def _events(self, setup: Setup) -> dict[str, Any]:
         sides = setup.field.lowered.sides if setup.field.lowered else ()
         return {"has_events": bool(self.event_names or sides), "most": self.most, "stopping": self.stopping}
 
     def _by_machine_code(self, setup: Setup, begun: Begun) -> "_Way":
-        form, start = self._form(setup), native_motion.start_of(setup, begun)
+        form, start = self._form(setup), start_of(setup, begun)
         assert isinstance(self.solver, Method)
         back = partial(native_motion.cotangents, form, self.solver, self.memory)
         run = flow(form, self.solver, self.order)
@@ -199,7 +224,7 @@ def in_sides(setup: Setup, begun: Begun) -> tuple[Setup, Begun]:
         return setup, begun
     merged = program is not field.program
     kept = lambda inputs: [x for x in inputs.channels if not (merged and isinstance(x, FunctionOfTime))]
-    program = with_sides(program, has_events, native_motion.modes_among(Inputs(tuple(kept(inputs)))))
+    program = with_sides(program, has_events, modes_among(Inputs(tuple(kept(inputs)))))
     field = replace(field, program=program, stops=program.stops)
 
     def within(args: tuple) -> tuple:
@@ -282,6 +307,59 @@ def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowe
     found = driven(program, inputs)
     program = program if isinstance(found, str) else found
     return program, program.watched(has_events)
+
+
+def reason_against(
+    field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None
+) -> str:
+    """Return why machine code cannot integrate a scene (by Taylor series if an `order` is given); empty if it
+    can.
+    """
+    if not isinstance(field, ByProgram):
+        return "the scene has no scalar program"
+    if reason := ffi.reason_against():
+        return reason
+    if samples_in(scene):
+        return "the scene itself has a sampled input"
+    if not all(
+        isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels
+    ):
+        return "an input is a function of time that captures arrays"
+    if isinstance(reason := driven(field.program, inputs), str):
+        return reason
+    if has_events and not field.lowers_events:
+        return "a stop event is not part of the scalar program"
+    return _reason_against_program(form_of(field, inputs, has_events, 1, True), order)
+
+
+@lru_cache(maxsize=64)
+def _reason_against_program(form: Form, order: int | None) -> str:
+    """Return why machine code cannot evaluate the program of a form; empty if it can."""
+    program, graph = form.program, form.program.graph
+    operations = graph.operations(form.nodes)
+    if operations > LARGEST_PROGRAM:
+        return f"the scalar program has {operations} operations, more than {LARGEST_PROGRAM}"
+    if reason := unsupported(graph, form.nodes):
+        return reason
+    if form.has_events and form.sampled:
+        sampled = {program.variables[len(program.variables) - len(program.inputs) + i] for i in form.sampled}
+        if sampled & set(graph.reachable(program.events)):
+            return "a stop event depends on an input that changes with time"
+    if form.has_events:
+        try:
+            event_program(form)
+        except Unsupported as error:
+            return f"the rate of a stop event has no scalar form ({error})"
+    return "" if order is None else _reason_against_series(form, order)
+
+
+def _reason_against_series(form: Form, order: int) -> str:
+    if form.sampled:
+        return "an input is given by samples"
+    if reason := taylor.reason_against(form.program.graph, form.rates):
+        return reason
+    count = taylor.products(form, order)
+    return f"Taylor series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 
 def width(program: Lowered) -> int:

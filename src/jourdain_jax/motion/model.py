@@ -13,7 +13,7 @@ from jourdain_jax.dynamics.reactions import needs_work
 from jourdain_jax.equations.rows import names_of_events, names_of_invariants
 from jourdain_jax.integrate.constraint_projection import Usual, usual_sizes
 from jourdain_jax.integrate.inputs import Inputs, as_inputs
-from jourdain_jax.integrate.loop import native_motion
+from jourdain_jax.integrate.own_steps import reason_against
 from jourdain_jax.integrate.vector_fields.field import Formulation, VectorField, as_formulation
 from jourdain_jax.kernels import ffi
 from jourdain_jax.lowering.lower import lowered
@@ -179,7 +179,7 @@ class Model(BuiltFor, Printed):
         reason = (
             "as requested"
             if self.backend == "xla"
-            else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
+            else reason_against(field, scene, as_inputs(scene, None), bool(self.events))
         )
         return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 

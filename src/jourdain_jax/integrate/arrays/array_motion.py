@@ -21,8 +21,7 @@ from jourdain_jax.integrate.explicit_steps import Method
 from jourdain_jax.integrate.implicit_steps import ImplicitMethod
 from jourdain_jax.integrate.loop.adjoint import moved
 from jourdain_jax.integrate.loop.form import Form
-from jourdain_jax.integrate.loop.loop_function import Found, Start, differentiated
-from jourdain_jax.integrate.loop.native_motion import control_of, modes_at_start
+from jourdain_jax.integrate.loop.loop_function import Found, Start, control_of, differentiated, modes_at_start
 from jourdain_jax.integrate.setup import Begun, Setup
 from jourdain_jax.integrate.vector_fields.field import Integrated
 

@@ -5,5 +5,5 @@
     form.py        layout of the memory                  loop.py         all steps of all samples
 
 A lane is the place of a vector register or an array in which one sample of a batch is integrated. Open
-`step.py` first, then `loop.py`; `native_motion.py` calls the loop.
+`step.py` first, then `loop.py`; `loop_function.py` calls the loop.
 """

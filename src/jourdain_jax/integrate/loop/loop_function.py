@@ -1,17 +1,22 @@
 """The loop of `loop.py` as a differentiable JAX function.
 
 The derivative of a motion is a motion whose state includes tangents. The loop itself computes the tangent of
-an event's time; all other times are constant here (`native_motion.py`). Tolerances, the first step and
+an event's time; all other times are constant here (`own_steps.py`). Tolerances, the first step and
 samples have no derivatives.
 
 `Start` and `Found` are the input and output of a loop, in machine code and in JAX.
+
+Inputs that are functions of time become part of the scalar program, which then depends on time and the
+numbers in these functions instead of the inputs.
+
+    u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: constants and captured numbers of f_i
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +24,21 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.derivative_errors import DifferentiationModeError
 from jourdain_jax.calculus.derivatives import filled, is_zero
-from jourdain_jax.calculus.reals import PerLane
+from jourdain_jax.calculus.markers import entries_of
+from jourdain_jax.calculus.reals import Indices, PerLane, PerTime, Scalar, real_type
 from jourdain_jax.integrate.event_search import RUNNING
 from jourdain_jax.integrate.explicit_steps import Method
+from jourdain_jax.integrate.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled
 from jourdain_jax.integrate.loop.form import PROGRESS, Form
 from jourdain_jax.integrate.loop.lanes import arguments_of_samples
 from jourdain_jax.integrate.loop.loop import write_loop
 from jourdain_jax.integrate.loop.rate_functions import check_derivatives
 from jourdain_jax.integrate.loop.taylor import TaylorSteps, products
+from jourdain_jax.integrate.loop.time_functions import with_functions
 from jourdain_jax.integrate.loop.value_kernels import called
+from jourdain_jax.integrate.setup import NONE_PASSED, Begun, Passed, Setup, Solved
+from jourdain_jax.integrate.vector_fields.field import ByProgram, Integrated, VectorField
+from jourdain_jax.lowering.lowered_equations import Lowered
 
 Numbers = tuple[PerLane, ...]  # one number per row
 
@@ -216,3 +227,127 @@ def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
     known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
     more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
     return replace(form, moving=(*form.moving, *moving)), more
+
+
+def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
+    """Return the form for machine code. `most`: maximum number of transitions of a motion; `stopping`:
+    whether stop events end it.
+    """
+    assert isinstance(field, ByProgram)
+    sampled = tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Sampled))
+    program = driven(field.program, inputs)
+    assert not isinstance(program, str), program
+    switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
+    of_events: dict[str, Any] = {}
+    if goes_on:
+        of_events = {"stops": program.stops, "most": most, "stopping": stopping, "sides": program.sides}
+    of_field = field.with_work, field.projects, field.affine, has_events, field.pivots
+    return Form(program, *of_field, sampled=sampled, switched=switched, **of_events)
+
+
+def modes_among(inputs: Inputs) -> Indices:
+    """Return the indices of modes among the inputs that are not functions of time."""
+    return tuple(i for i, channel in enumerate(others_of(inputs)) if isinstance(channel, Mode))
+
+
+def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
+    """Return the program with functions of time substituted for inputs, or why that is not possible."""
+    channels = inputs.channels
+    functions = tuple(x.program if isinstance(x, FunctionOfTime) else None for x in channels)
+    return with_functions(program, functions) if any(functions) else program
+
+
+def start_of(setup: Setup, begun: Begun) -> Start:
+    """Return the arguments of the kernel for a motion."""
+    args, goals = begun.shared, setup.times.goals
+    knots = setup._replace(inputs=args[2]).knots
+    # zeros stand for sampled inputs, which the kernel interpolates
+    known, plain = (
+        tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(part))
+        for part in (begun.args, args)
+    )
+    origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
+    samples, control = _samples(args, goals, knots), control_of(setup, knots)
+    tables = tuple(jax.tree.leaves([x for x in begun.args[2].channels if isinstance(x, Sampled)]))
+    y = (begun.y0.rows,)
+    return Start(samples, control, goals, origin, y, (known,), modes, plain, tables, begun.code)
+
+
+def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
+    """Return the modes at the start, as indices of their values."""
+    return tuple(
+        jax.lax.stop_gradient(jnp.asarray(channel.value, real_type()))
+        for channel in inputs.channels
+        if isinstance(channel, Mode)
+    )
+
+
+def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Scalar, ...]:
+    """Return tolerances and limits of steps in the order of `Start.control`."""
+    control = *setup.tolerances, setup.longest, setup.dt0, setup.most_steps(knots)
+    return tuple(jnp.asarray(x, real_type()) for x in control)
+
+
+def known_of(args: tuple) -> list:
+    """Return the known numbers of the rates: numbers that depend only on parameters, numbers of functions of
+    time, and constant inputs. Entries of sampled inputs are None.
+    """
+    _, _, inputs, fixed, _ = args
+    functions = [
+        x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)
+    ]
+    return [
+        *fixed,
+        *functions,
+        *(channel.value if isinstance(channel, Constant) else None for channel in others_of(inputs)),
+    ]
+
+
+def others_of(inputs: Inputs) -> list[Callable]:
+    """Return the inputs that are not functions of time."""
+    return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
+
+
+def _samples(args: tuple, goals: PerTime, knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
+    """Return the tables and knots of sampled inputs, as arguments of the kernel; empty if there are none."""
+    _, _, inputs, _, origin = args
+    origin = jax.lax.stop_gradient(origin)  # samples are interpolated at fixed times since the start
+    channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
+    if not channels:
+        return ()
+    count = max(2, *(len(channel.ts) for channel in channels))
+
+    def padded(x: Array, with_what) -> Array:
+        return jnp.concatenate([x, jnp.full(count - len(x), with_what, x.dtype)])
+
+    tables = jnp.stack(
+        [
+            jnp.stack([padded(channel.ts - origin, jnp.inf), padded(channel.values, channel.values[-1])])
+            for channel in channels
+        ]
+    )
+    return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
+
+
+def solved(form: Form, goals: PerTime, found: Found) -> Solved:
+    """Return the result of a loop as a `Solved`."""
+    h, pivot, count = (found.rest[i] for i in (0, 5, 7))
+    (states,), (end,), (t,), (log,) = found[:4]
+    code, accepted, rejected, event, _, crossings = found.rest.astype(jnp.int32)[1:7]
+    reached = (jnp.arange(len(goals)) < count) | (goals == t)
+    ys = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1])
+    most = form.transitions
+    passed = NONE_PASSED
+    if most:
+        there = jnp.arange(most) < found.rest[8]
+        more = jnp.where(there, jnp.reshape(found.rest[9:], (2 + form.modes, most)), 0.0)
+        times = jnp.where(there, log, jnp.inf)
+        passed = Passed(times, more[0].astype(jnp.int32), more[-1], more[1:-1])
+    y_end, of_steps = Integrated.of(end, form), (accepted, rejected, h, pivot, crossings)
+    return Solved(goals[:-1], ys, reached[:-1], t, y_end, code, event, *of_steps, passed)
+
+
+def numbers_of(channel: FunctionOfTime) -> list:
+    """Return all numbers of a function of time as a flat list."""
+    parts = [jnp.reshape(part, -1) for part in (channel.numbers, *channel.held)]
+    return [x for part in parts if len(part) for x in entries_of(part)]
