@@ -15,11 +15,11 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 475_403,
+    "code tokens of src": 475_452,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
     "caches": 50,
-    "named numbers": 297,
+    "named numbers": 298,
     "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,
     "ways: projection of a state onto its constraints": 3,
@@ -27,7 +27,7 @@ CEILINGS = {
     "ways: values and derivatives of constraints, for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, event search, adjoint": 1,
-    "code tokens of tests": 292_254,
+    "code tokens of tests": 292_432,
     "code tokens of bench": 98_611,
     "test files that reach private names": 32,
 }

@@ -615,6 +615,23 @@ def test_a_cart_falls_onto_two_runners():
         assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-8)
 
 
+def test_a_cart_clatters_until_it_rests():
+    """Runners without friction strike in turn, at shrinking intervals, until the cart stands on both. The
+    rebound of one may be lower than round-off while the other has just struck.
+    """
+    drawn = jax.random.uniform(jax.random.key(0), (4, 200), minval=-1.0)
+
+    def end(pitch, pitch_rate, speed, bounce):
+        scene = Cart(friction=0.0, bounce=jnp.maximum(0.1 + 0.2 * bounce, 0.0))
+        start = {"z": 0.7, "pitch": 0.15 * pitch, "pitch_rate": pitch_rate, "x_rate": speed}
+        motion = jj.simulate(scene, start, ts=[4.0], rtol=1e-8, atol=1e-8)
+        return motion.result, motion.q[0, :3]
+
+    result, q = jax.vmap(end)(*drawn)
+    assert_array_equal(result, SUCCESS)
+    assert_allclose(q.T, [4 * drawn[2], jnp.full(200, 0.5), jnp.zeros(200)], atol=1e-10)
+
+
 class Belt(jj.Scene):
     """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s."""
 

@@ -143,6 +143,7 @@ def with_slots(q: PerCoordinate, slots: Float[Array, "contacts 2"]) -> PerCoordi
 
 # numerics, m: greatest depth below the ground of the flight that sums bounces; less makes round-off larger
 SETTLES = 1e-11
+LOWEST = 1e-15  # numerics, m: a rebound lower than this is round-off of the gap
 STEADY = 1e-2  # numerics: greatest relative change of speed from a rebound to the next impact of a series
 
 
@@ -181,30 +182,31 @@ class After(NamedTuple):
 def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: ContactFlags) -> After:
     """Return speeds, modes and directions of slip after an event of contact i.
 
-    If contacts strike, impulses of impact act; otherwise, where a slip `stops`, impulses remove the remaining
-    slip. Then Coulomb's law for accelerations decides which contacts without slip open, stick or begin to
-    slip. Contacts at which slip `begins` slip. If the law has no solution, or an impact would gain energy,
-    the mode of contact i becomes a negative number, a code for the reason.
+    If contacts strike, impulses of impact act. Impulses also remove slip that `stops`, and speeds of
+    round-off at which closed contacts would open. Then Coulomb's law for accelerations decides which contacts
+    without slip open, stick or begin to slip. Contacts at which slip `begins` slip. If the law has no
+    solution, or an impact would gain energy, the mode of contact i becomes a negative number, a code for the
+    reason.
     """
     motion, rows = at.motion, at.found.rows
     hits, goes_on = jnp.any(strikes), jnp.any(begins)
     closed = (at.number != FLIES) | strikes | (hits & at.settles)
     P, stays, sticks, has_law, is_decided, several = _struck(at, closed, strikes, i)
-    held = at.modes._replace(rolls=jnp.where(stops, 1.0, at.modes.rolls))
-    stopping = responses(at.found.G, rows.w[:, None], held, at.friction)[:, 0]
-    P = jnp.where(goes_on, 0.0, jnp.where(hits, P.ravel(), stopping))
-    rolls = jnp.where(hits, sticks, held.rolls)
+    P = jnp.where(hits, P.ravel(), 0.0)
     w = (rows.w + at.found.G @ P).reshape(-1, 3)
-    gained = 0.5 * P @ (rows.w + w.ravel())
-    u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
-
-    # a contact without an impulse, at rest up to round-off, counts as open in the law, but stays
-    touches = jnp.where(hits, stays | (closed & (w[:, 0] < LEAST_SLIP)), closed)
+    # in the law, a contact that touches without an impulse and leaves by round-off is open
+    slow = w[:, 0] < LEAST_SLIP + jnp.sqrt(2 * LOWEST * jnp.abs(at.found.b[::3]))
+    touches = jnp.where(hits, stays | (closed & slow), closed)
+    rolls = jnp.where(hits, sticks, jnp.where(stops, 1.0, at.modes.rolls))
     slides = touches & jnp.where(goes_on, at.number == SLIPS, moves(w, LEAST_SLIP) & (rolls == 0))
     e = jnp.where((slides & ~goes_on)[:, None], unit(w[:, 1:]), at.modes.direction)
     numbers = jnp.where(touches, jnp.where(slides, SLIPS, ROLLS), FLIES)
+    modes, zero = Modes(1.0 * touches, 1.0 * (touches & ~slides), e), jnp.zeros_like(at.friction)
+    P += responses(at.found.G, w.reshape(-1, 1), modes, zero)[:, 0]
+    w = (rows.w + at.found.G @ P).reshape(-1, 3)
+    gained = 0.5 * P @ (rows.w + w.ravel())
+    u = motion.u.array + jnp.where(jnp.isfinite(gained), at.found.impulses @ P, 0.0)
     then = at.then(numbers, e, motion.q.array, u)
-    zero = jnp.zeros_like(at.friction)
     response = then.found.G, then.found.b, zero, then.friction, then.static
     rest = coulomb(Law(*response, touches, slides, begins, e))
     numbers = jnp.where(rest.modes.closed > 0, jnp.where(rest.modes.rolls > 0, ROLLS, SLIPS), FLIES)
@@ -235,7 +237,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
 NEARLY = 1e-4  # numerics: least share of the ground's response that friction leaves; 0 at Painleve's paradox
 # numerics, m/s: slip ends at this speed against its direction; larger than the round-off when it starts
 STOPS = 1e-13
-SAME = 1e-12  # numerics, m: a contact that closes within this gap strikes together with another
+SAME = 1e-12  # numerics, s: a contact that closes within this time strikes together with another
 TOUCHES = 1e-8  # numerics, m: a gap below this counts as closed at the start
 
 
@@ -264,7 +266,7 @@ def contact_changes(at: At) -> dict[str, Event]:
     speeds or forces jump, all modes come from `after`; otherwise only that of the event's contact changes.
     """
     events, names, now = {}, at.scene.switching.contacts, at.motion.u.array
-    together = (at.found.rows.gap < SAME) & (at.w[:, 0] < 0)
+    together = (at.found.rows.gap < -SAME * at.w[:, 0]) & (at.w[:, 0] < 0)
     values = contact_events(at)
     for i, name in enumerate(names):
         number, own = at.number[i], jnp.arange(len(names)) == i

@@ -322,7 +322,7 @@ def monitored(
             side = is_side(w, form, changed["event"])  # numbers of several relations may vanish together
             flat = ~side & (over | is_flat(w, rate, slope))
             quiet = side & (w.magnitude(rate * p["last_goal"]) <= slowest(w, p))
-            passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise, found)
+            passing = Happened(changed["event"], changed["t"], flat, quiet, goes, noise)
             stuck, repeats = w.room(), follows & any_of(sinks)
             w.store(0.0, stuck)
             w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))

@@ -219,7 +219,6 @@ class Happened(NamedTuple):
     quiet: Number  # whether it has no effect, because it belongs to a relation whose number is at rest
     here: Number  # lanes in which it happened
     noise: Number  # time in which a value rises by its round-off
-    found: Number  # whether a search located it
 
 
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
@@ -228,7 +227,7 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     If a motion cannot continue, its code is stored in `stuck`: a mode is negative (a code for failed
     contacts), or a relation would change back at once.
     """
-    event, t, flat, quiet, switches, noise, found = happened
+    event, t, flat, quiet, switches, noise = happened
     side = is_side(w, form, event)
     rows, of, count = form.rows, form.rows_of_transition, form.integrated
     sizes = of["t"].stop, count, len(form.monitored), form.events, form.events, form.events
@@ -267,7 +266,7 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
         # an event whose value does not jump, as in an impact, leaves it at zero: all else is round-off
-        stays = this & found & ~side & w.equal(c, w.load(before, i))
+        stays = this & ~side & w.equal(c, w.load(before, i))
         left_now = switches & ~stays & is_left(w, c, rate, noise)
         off = w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old))
         disarmed.append(w.where(stays & (rate > 0.0) & ~rises, SLOWLY, off))
