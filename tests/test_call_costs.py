@@ -3,15 +3,13 @@ dropped again, and numbers stay numbers.
 """
 
 import functools
-import subprocess
-import sys
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from code_map import MOST_FILES
+from figures import fresh
 from numpy.testing import assert_allclose
 from small_scenes import OnPlane
 
@@ -125,28 +123,32 @@ import numpy as np, jourdain_jax as jj
 from jourdain_jax.kernels import host
 host.EFFORT = 0  # of LLVM, as in the other tests
 disc = jj.models.TiltingDisc()
-values = {"lean": 0.3, "spin_rate": -3.0}
+values, counts = {"lean": 0.3, "spin_rate": -3.0}, []
 for start in (values, jj.start(disc, **values)):
     def run():
         return jj.simulate(disc, start, ts=np.array([0.5]))
     run()
     profile = cProfile.Profile()
     profile.runcall(run)
-    stats = pstats.Stats(profile)
-    print(stats.total_calls)
-print(*sorted({file.split("jourdain_jax/")[-1] for file, *_ in stats.stats if "/jourdain_jax/" in file}))
+    counts.append(pstats.Stats(profile).total_calls)
+print(counts)
 """
 
 
 def test_a_warm_call_from_python_is_short():
-    """Counted in calls of Python functions, which no other load on the machine changes, and in files of our
-    own, in a process that checks no types.
+    """Counted in calls of Python functions, which no other load on the machine changes, in a process that
+    checks no types.
     """
-    done = subprocess.run([sys.executable, "-c", WARM_CALL], capture_output=True, text=True, check=True)
-    of_names, of_state, *files = done.stdout.split()
-    assert int(of_state) < 590  # 536 at the time of writing
-    assert int(of_names) < 760  # 698 at the time of writing: a program for the start, and one for the motion
-    assert len(files) <= MOST_FILES["warm"], files
+    of_names, of_state = fresh(WARM_CALL)
+    assert of_state < 590  # 536 at the time of writing
+    assert of_names < 760  # 698 at the time of writing: a program for the start, and one for the motion
+
+
+def test_calls_run_few_files():
+    """Counted in files of the package of which a function runs (`bench/code_map.py`)."""
+    program = "import code_map, json; print(json.dumps(code_map.observed_calls('tilting-disc')))"
+    found = fresh(program, JOURDAIN_JAX_CACHE="0").values()  # of build, first, gradient, warm
+    assert (np.array([*map(len, found)]) <= [69, 37, 48, 13]).all(), found
 
 
 LOSSES = {
