@@ -17,8 +17,8 @@ function observed: files of the package of which some function runs
     warm        in one more `jj.simulate`
 
 `tests/test_code_map.py` holds what is read as ceilings, `tests/test_call_costs.py` the files of the first
-model. The JSON is a list of {"figure", "model", "value",
-"required", "met"}; `--quick`: one model; `--private`: which private modules every test file reaches.
+model. The JSON is a list of {"figure", "model", "value", "required", "met"}; `--quick`: one model;
+`--private`: which private modules every test file reaches.
 """
 
 import ast
