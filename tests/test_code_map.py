@@ -15,7 +15,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 475_452,
+    "code tokens of src": 475_285,
     "code tokens of docs": 13_475,
     "code tokens of notebooks": 7431,
     "caches": 50,

@@ -277,13 +277,8 @@ def linearize(
     found = _about(instant_of(built, y, masses=True), scene, state, f, y, dependent, coordinates)
     if holds(lambda pivot: ~(pivot < WELL_CONDITIONED), found.pivot):
         return found
-    if privileged is None and scene.privileged is None:
-        chosen = privileged_at(scene, state, f, y)
-        found = (
-            found
-            if chosen == y
-            else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
-        )
+    if privileged is None and scene.privileged is None and (chosen := privileged_at(scene, state, f, y)) != y:
+        found = _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` are not determined by its "

@@ -30,7 +30,8 @@ from jourdain_jax.kernels import ffi
 from jourdain_jax.kernels.scalar_program import unsupported
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered_equations import Lowered, NotLowered
-from jourdain_jax.program.derivative import derivatives, jacobian
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.derivative import matrix as dense_jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
@@ -85,11 +86,9 @@ class Sloped:
         guards: Sequence[int],
         matrix: Nodes | None = None,
     ) -> None:
-        D, column = np.full((len(v), len(columns)), graph.zero), {x: k for k, x in enumerate(columns)}
-        for row, slopes in zip(D, jacobian(graph, v, columns), strict=True):
-            row[[column[x] for x in slopes]] = [*slopes.values()]
         matrix = np.zeros((0, 0), int) if matrix is None else matrix
-        parts = [np.array(v, int), D, matrix, np.array(guards, int)]
+        D = dense_jacobian(graph, v, columns)
+        parts = [np.array(part, int) for part in (v, D, matrix, guards)]
         nodes = np.unique(np.concatenate([*map(np.ravel, parts)])).tolist()
         self._which = [np.searchsorted(nodes, part) for part in parts]
         self._values, self.is_made = node_values(graph, nodes, given), not unsupported(graph, nodes)

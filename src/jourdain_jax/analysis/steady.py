@@ -214,7 +214,7 @@ class _Problem(eqx.Module):
 @compiled_quickly
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: int) -> SteadyMotion:
     guess, n, still = jnp.concatenate([q, u]), len(q), jax.lax.stop_gradient(problem)
-    size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)
+    size = jnp.where(free, jnp.asarray(sizes(problem.scene), guess.dtype), 0.0)
     eps = float(eps_of(guess))
     round_off = eps**0.5
     z = smooth_root(

@@ -12,7 +12,7 @@ Eigenvalues of small motions are matched along a family, so that each column fol
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -185,7 +185,7 @@ class SteadyEquations(Motions):
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([self.instant.states[0] - 1 + columns, varied]).astype(int)
-        self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
+        self.size = np.append(sizes(scene)[columns - 1], [abs(x) or 1.0 for x in self.given[varied]])
         self.by_name = dict(
             zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True)
         )
@@ -243,10 +243,10 @@ def numbered(scene: Scene) -> Scene:
     return jax.tree.unflatten(treedef, np.cumsum([0, *map(np.size, leaves[:-1])]).tolist())
 
 
-def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
-    """Return the sizes of the coordinates `kept` (from their domain) and of all speeds. Sizes are the units
-    of the unknowns.
+def sizes(scene: Scene) -> np.ndarray:
+    """Return the sizes of the coordinates (from their domain) and of the speeds. Sizes are the units of the
+    unknowns.
     """
     low, high = coordinate_bounds(scene)
-    of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]
-    return np.array([*of_coordinates, *[10.0] * len(scene.speed_names.entries)])  # SI units
+    of_coordinates = np.where(high > low, high - low, 1.0)
+    return np.append(of_coordinates, [10.0] * len(scene.speed_names.entries))  # SI units

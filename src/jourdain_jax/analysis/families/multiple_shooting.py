@@ -44,7 +44,7 @@ class Shooting(eqx.Module):
     @property
     def sizes(self) -> Float[np.ndarray, "states"]:
         """Return the sizes of coordinates and speeds."""
-        return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
+        return sizes(self.scene)
 
     @property
     def is_unknown(self) -> Bool[np.ndarray, "all_unknowns"]:

@@ -98,16 +98,10 @@ class PeriodicMotion(Printed, eqx.Module):
             f"{head}: residual {float(self.residual):.1e}",
             *([f"in a period, it shifts {shifts}"] if shifts else []),
             str(self.state),
+            f"multipliers: {', '.join(complex_numbers(self.multipliers))} "
+            f"({'stable' if self.stable else 'unstable'})",
         ]
-        return "\n".join(
-            [
-                *lines,
-                (
-                    f"multipliers: {', '.join(complex_numbers(self.multipliers))} "
-                    f"({'stable' if self.stable else 'unstable'})"
-                ),
-            ]
-        )
+        return "\n".join(lines)
 
 
 @shown_from_users_lines

@@ -94,23 +94,6 @@ def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[
         yield Test(DOUBLE, square, (SURE * (1 + abs(before[a]))) ** 2, (a, b))
 
 
-def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
-    """Return the unit tangents of the two curves that cross at a branch point: the vectors a in the null
-    space of J with l . R_zz a a = 0.
-
-    R_zz is a central difference of J. Only one of the left null vectors l gives a nonzero quadratic form.
-    """
-    look = equations(z)
-    U, _, V = np.linalg.svd(look.J)
-    left, null, h = U[:, look.J.shape[1] - 2 :], V[:-3:-1].T, 1e-4  # h: in sizes of the unknowns
-    of_a, of_b = ((equations(z + h * v).J - equations(z - h * v).J) @ null / (2 * h) for v in null.T)
-    aa, ab, bb = np.linalg.svd(left.T @ np.column_stack([of_a, of_b[:, 1]]))[2][0]
-    (low, high), axes = np.linalg.eigh([[aa, ab], [ab, bb]])
-    if low * high >= 0:
-        return [*null.T]
-    return [null @ axes @ [np.sqrt(high), side * np.sqrt(-low)] / np.sqrt(high - low) for side in (1, -1)]
-
-
 def followed(
     equations: Motions, begin: Point, targets: Targets, most: int
 ) -> tuple[list[Point], tuple[str, str]]:
@@ -204,9 +187,21 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
 
 
 def across(equations: Motions, tangent: Vector) -> Point:
-    """Return the branch point at the guess, with the tangent of the other curve through it."""
-    other = min(
-        tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent)
-    )
-    look = equations(equations.start)
-    return Point(equations.start, other, look, equations.eigenvalues(look, other))
+    """Return the branch point at the guess, with the unit tangent of the other curve through it.
+
+    The tangents of both curves are the vectors a in the null space of J with l . R_zz a a = 0. R_zz is a
+    central difference of J. Only one of the left null vectors l gives a nonzero quadratic form. If it has
+    no such zeros, the null vectors themselves are taken.
+    """
+    z = equations.start
+    look = equations(z)
+    U, _, V = np.linalg.svd(look.J)
+    left, null, h = U[:, look.J.shape[1] - 2 :], V[:-3:-1].T, 1e-4  # h: in sizes of the unknowns
+    of_a, of_b = ((equations(z + h * v).J - equations(z - h * v).J) @ null / (2 * h) for v in null.T)
+    aa, ab, bb = np.linalg.svd(left.T @ np.column_stack([of_a, of_b[:, 1]]))[2][0]
+    (low, high), axes = np.linalg.eigh([[aa, ab], [ab, bb]])
+    if low * high < 0:
+        a, b = np.sqrt([high, -low] / (high - low))
+        null = null @ axes @ [[a, a], [b, -b]]
+    other = min(null.T, key=lambda t: abs(t @ tangent))
+    return Point(z, other, look, equations.eigenvalues(look, other))
