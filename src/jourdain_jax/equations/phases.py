@@ -171,12 +171,15 @@ def _struck(at: At, touches: ContactFlags, strikes: ContactFlags, i: int) -> tup
 
 
 class After(NamedTuple):
-    """The state after an event of contact i. `slots`: as in the state; `direction`: of slip of contact i."""
+    """The state after an event of contact i. `slots`: as in the state; `direction`: of slip of contact i;
+    `found`: the response at these coordinates and speeds, in the modes before the law for accelerations.
+    """
 
     numbers: PerContact
     slots: Float[Array, "contacts 2"]
     u: Speeds
     direction: Float[Array, "2"]
+    found: ContactResponse
 
 
 def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: ContactFlags) -> After:
@@ -231,7 +234,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
         *flat,
     ):
         numbers = numbers.at[i].set(jnp.where(fault, why, numbers[i]))
-    return After(numbers, slots, u, rest.modes.direction[i])
+    return After(numbers, slots, u, rest.modes.direction[i], then.found)
 
 
 NEARLY = 1e-4  # numerics: least share of the ground's response that friction leaves; 0 at Painleve's paradox
@@ -330,12 +333,12 @@ def contacts_at_start(at: At) -> Float[Array, "numbers"]:
     q, u = put_back(at.then(numbers, e, q, u, at.found))
     no = jnp.zeros_like(strikes)
     first = next((i for i, row in enumerate(at.rows) if row.impact != "moreau"), 0)
-    begun = after(at.then(numbers, e, q, u), first, strikes, no, no)
-    numbers, q, u = begun.numbers, with_slots(q, begun.slots), begun.u
-    then = at.then(numbers, begun.slots, q, u)
+    numbers, slots, u, _, found = after(at.then(numbers, e, q, u), first, strikes, no, no)
+    # of the response, `_bearing` reads G alone, which does not depend on modes or directions of slip
+    then = at.then(numbers, slots, q, u, found)
     bears = jnp.stack([_bearing(then, i) > 0 for i in range(len(numbers))])
     numbers = jnp.where((numbers == SLIPS) & ~bears, PAINLEVE, numbers)
-    return jnp.hstack([numbers, jnp.max(-gap, initial=0.0), q, u])
+    return jnp.hstack([numbers, jnp.max(-gap, initial=0.0), then.motion.q.array, u])
 
 
 def _bearing(at: At, i: int) -> Scalar:
