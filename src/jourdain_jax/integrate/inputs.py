@@ -354,8 +354,8 @@ def as_inputs(scene: Scene, given) -> Inputs:
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """Raise ValueError if velocity constraints depend on a mode, or on an input that jumps in the span."""
-    traced, modes = looked_at(scene).traced, dict(scene.modes.pairs)
     known = structure_of(scene).rows_of_inputs and not is_traced(scene, inputs, t0, t1)
+    traced, modes = looked_at(scene).traced, dict(scene.modes.pairs)
     each = zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True)
     for name, node, channel in each:
         changes = known and not isinstance(channel, Constant | Sampled)

@@ -266,8 +266,8 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         return replace(found, unproved=unproved)
     except Unsupported as reason:
         raise ValueError(
-            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give "
-            "that part a rule with `jax.custom_jvp`"
+            f"the motion of `{type(scene).__name__}` needs {reason}; it is too large or has no forward mode; "
+            "give that part a rule with `jax.custom_jvp`, or `friction=` to fewer contacts"
         ) from None
 
 
