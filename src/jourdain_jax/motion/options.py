@@ -140,7 +140,7 @@ GONE = {  # replacements of removed options
         f"all motions have derivatives in forward and in reverse mode; for a diffrax adjoint {_BY_DIFFRAX}"
     ),
     "dt0": (
-        "the first step is 1e-4 of the span; structure-preserving solvers have their own, as in "
+        "the first step is 7e-4 of the span; structure-preserving solvers have their own, as in "
         "solver=jj.ImplicitMidpoint(step=0.01)"
     ),
     "memory": "a model has its own; pass it to `jj.build`",
