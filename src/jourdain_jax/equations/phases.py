@@ -31,7 +31,7 @@ acceleration. If a single flight of that duration ends at most `SETTLES` below t
 and the contact then closes with restitution 0. During this flight, the two slots of the slip direction hold
 the time at which it ends, and 1; during earlier flights, the speed w of the last rebound, and 0. If the body
 strikes with another speed, because another contact struck in between, the series is not steady, and its
-bounces go on down to `LEAST_SLIP`.
+bounces go on until one is lower than `LOWEST`.
 
 `At` holds the switching contacts at one state: their modes and their response to forces.
 """
@@ -197,7 +197,7 @@ def after(at: At, i: int, strikes: ContactFlags, stops: ContactFlags, begins: Co
     P, stays, sticks, has_law, is_decided, several = _struck(at, closed, strikes, i)
     P = jnp.where(hits, P.ravel(), 0.0)
     w = (rows.w + at.found.G @ P).reshape(-1, 3)
-    # in the law, a contact that touches without an impulse and leaves by round-off is open
+    # the law opens contacts that have no impulse and leave at a speed of round-off; they stay closed
     slow = w[:, 0] < LEAST_SLIP + jnp.sqrt(2 * LOWEST * jnp.abs(at.found.b[::3]))
     touches = jnp.where(hits, stays | (closed & slow), closed)
     rolls = jnp.where(hits, sticks, jnp.where(stops, 1.0, at.modes.rolls))

@@ -193,7 +193,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
     # as arrays, so that a new tolerance needs no compilation
     tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))
-    # diffrax's own guess would compile two more copies of the vector field
+    # after two tenfold steps it is the longest; diffrax's own guess would compile the vector field twice more
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 7e-4) * (t1 - t0)
     longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     judged = model.once("judged", lambda: is_judged(scene))
